@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "missing_anomaly", "other_units",
     "placed", "positions", "reference_field", "require_date", "separate_observatories", "sphere_radius",
-    "with_daily_variation", "with_true_heading",
+    "variation_level_sigma", "with_daily_variation", "with_true_heading",
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
@@ -283,6 +283,8 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
 
 MAX_EXTRAPOLATION_S = 600.0
 """Longest time beyond the ends of a station's log for which its end value holds, s."""
+DAY_S, DAILY_RANGE_NT = 86_400.0, 45.0
+"""Length of a day, s, and usual range of the quiet daily variation, nT: the geometric mean of 20 and 100."""
 
 
 def separate_observatories(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
@@ -294,21 +296,49 @@ def separate_observatories(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset]
 def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[xr.Dataset]:
     """Return the vehicle's logs with the variation of a base station's field as ``daily_variation``, nT.
 
-    `base` has ``total_field`` (nT), ``reference_field`` or a raw vector. FormatError: `base` has none of
+    `base` has ``total_field`` (nT), ``reference_field`` or a raw vector. The variation is about its median,
+    and its attribute ``level_sigma`` is the 1-sigma of this level, nT. FormatError: `base` has none of
     them. DataError: `base` does not cover the logs' time.
     """
     total = _total(base)
     known = np.isfinite(total)
     time = base["time"].to_numpy()[known]
     varied = total[known] - np.median(total[known]) if known.any() else total[known]
+    described = {"units": "nT", "level_sigma": _level_sigma(time, varied)}
     found = []
     for log in logs:
         t = log["time"].to_numpy()
         if not len(time) or t[0] < time[0] - MAX_EXTRAPOLATION_S or t[-1] > time[-1] + MAX_EXTRAPOLATION_S:
             source = base.attrs.get("source", "the base station's log")
             raise DataError(f"{source}: does not cover the time of {log.attrs.get('source', 'the log')}")
-        found.append(log.assign(daily_variation=("time", np.interp(t, time, varied), {"units": "nT"})))
+        found.append(log.assign(daily_variation=("time", np.interp(t, time, varied), described)))
     return found
+
+
+def _level_sigma(time: FloatArray, variation: FloatArray) -> float:
+    """Return the 1-sigma, nT, of the median of a base station's variation (n,) as that of all days.
+
+    Notes
+    -----
+    Values of the autocorrelation ρ hold ``N = n / (1 + 2 Σ ρ)`` independent ones, the sum up to the first ρ
+    that is not positive, and their mean has the variance ``s² / (N - 1)``. A record shorter than a day also
+    lacks a part of the daily variation: a sine of range R has the variance ``R² / 8`` about its mean.
+    """
+    size = len(variation)
+    if not size:
+        return 0.0
+    # N from the autocovariance, by the power spectrum of the padded record.
+    power = np.abs(np.fft.rfft(variation - variation.mean(), 2 * size)) ** 2
+    autocovariance = np.fft.irfft(power)[:size]
+    positive = autocovariance[: int((autocovariance <= 0.0).argmax()) or size]
+    independent = size * autocovariance[0] / (2.0 * positive.sum() - autocovariance[0] or 1.0)
+    unseen = max(1.0 - (time[-1] - time[0]) / DAY_S, 0.0)
+    return float(np.sqrt(variation.var() / max(independent - 1.0, 1.0) + unseen * DAILY_RANGE_NT**2 / 8.0))
+
+
+def variation_level_sigma(log: xr.Dataset) -> float:
+    """Return the 1-sigma of the level of a log's ``daily_variation``, nT; 0 without a base station."""
+    return float(log["daily_variation"].attrs.get("level_sigma", 0.0)) if "daily_variation" in log else 0.0
 
 
 def _total(base: xr.Dataset) -> FloatArray:

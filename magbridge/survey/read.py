@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,7 +26,7 @@ from magbridge.diagnostics import Diagnostic
 from magbridge.errors import DataError, FormatError
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
-from magbridge.field.reference import main_field, placed, positions, require_date
+from magbridge.field.reference import main_field, placed, positions, require_date, variation_level_sigma
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 from magbridge.survey.samples import Samples
@@ -128,7 +129,7 @@ def corrected_by_others(ds: xr.Dataset) -> Samples:
         raise FormatError(source, "expected mag_x mag_y mag_z, total_field or anomaly")
     samples, known = _unflagged(ds, ds, value)
     level_sigma = float(ds["level_sigma"].median()) if "level_sigma" in ds else 0.0
-    return replace(samples.part(known), level_sigma=level_sigma)
+    return replace(samples.part(known), level_sigma=hypot(samples.level_sigma, level_sigma))
 
 
 def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
@@ -149,7 +150,7 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
         samples.part(known),
         rho=None if calibration.warnings else calibration.noise.autocorrelation,  # else it is the crust
         modes=_modes(apart_from_level(calibration), field, read, samples.time[known]),
-        level_sigma=calibration.reference.level_sigma,
+        level_sigma=hypot(samples.level_sigma, calibration.reference.level_sigma),
     )
 
 
@@ -174,7 +175,8 @@ def located(ds: xr.Dataset, value: FloatArray, name: str = "a field") -> tuple[S
         if "line_type" in ds:
             tie = np.isin(np.char.upper(ds["line_type"].to_numpy().astype(str)), TIE)
     time = np.asarray(ds["time"].to_numpy(), float)
-    return Samples(place, depth, time, value, line, tie, origin), known
+    level_sigma = variation_level_sigma(ds)
+    return Samples(place, depth, time, value, line, tie, origin, level_sigma=level_sigma), known
 
 
 def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:

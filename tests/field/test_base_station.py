@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from magbridge.cli.common import by_base_station
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.igrf import igrf
-from magbridge.field.reference import with_daily_variation
+from magbridge.field.reference import variation_level_sigma, with_daily_variation
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment
+from magbridge.survey.read import corrected_by_others
 
 START = 1_700_000_040.0
 OFFSET = np.array([300.0, -200.0, 100.0])
@@ -73,6 +74,42 @@ def test_a_station_of_another_day(storm: Path) -> None:
     log, station = read("log.csv"), read("mde.min")
     with pytest.raises(DataError, match=r"^mde\.min: does not cover the time of log\.csv$"):
         with_daily_variation([log.assign_coords(time=log["time"] + 86_400.0)], station)
+
+
+@pytest.mark.parametrize("hours", [2.0, 6.0, 12.0])
+def test_the_level_of_a_base_station_is_uncertain(hours: float) -> None:
+    """The true level is that of all days: of a daily variation and a faster one, of random phases."""
+    rng = np.random.default_rng(1)
+    time = START + np.arange(0.0, 3600.0 * hours, 60.0)
+    log = deployment("log", time, {"anomaly": 0.0 * time, "latitude": 0.0 * time, "longitude": 1e-5 * time})
+    off, sigma = [], []
+    for _ in range(60):
+        phases = rng.uniform(0.0, 2.0 * np.pi, 2)
+        variation = 20.0 * np.sin(2.0 * np.pi * time / 86_400.0 + phases[0])
+        variation += 15.0 * np.sin(2.0 * np.pi * time / 18_000.0 + phases[1])
+        base = deployment(
+            "base", time, {"total_field": 50_000.0 + variation + rng.normal(0.0, 0.2, time.size)}
+        )
+        (found,) = with_daily_variation([log], base)
+        off.append(float(np.mean(found["daily_variation"].to_numpy() - variation)))
+        sigma.append(corrected_by_others(found).level_sigma)
+    assert 0.5 < np.sqrt(np.mean(np.square(off) / np.square(sigma))) < 1.25
+    exact = found.assign(level_sigma=("time", np.full(time.size, 100.0)))
+    assert corrected_by_others(exact).level_sigma == pytest.approx(np.hypot(100.0, sigma[-1]))
+    assert corrected_by_others(log).level_sigma == 0.0
+
+
+def test_whole_days_of_a_base_station_determine_its_level() -> None:
+    time = START + np.arange(0.0, 20 * 86_400.0, 300.0)
+    field = (
+        50_000.0
+        + 20.0 * np.sin(2.0 * np.pi * time / 86_400.0)
+        + np.random.default_rng(0).normal(size=time.size)
+    )
+    (found,) = with_daily_variation(
+        [deployment("log", time, {})], deployment("base", time, {"total_field": field})
+    )
+    assert variation_level_sigma(found) < 3.0
 
 
 def test_two_observatories_are_not_one_base_station() -> None:

@@ -15,7 +15,13 @@ from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, require
 from magbridge.datasets import standard_log
 from magbridge.errors import CalibrationError, WrongUse
 from magbridge.field.geodesy import separation
-from magbridge.field.reference import earth_field, placed, positions, with_true_heading
+from magbridge.field.reference import (
+    earth_field,
+    placed,
+    positions,
+    variation_level_sigma,
+    with_true_heading,
+)
 from magbridge.one_time import interpolate_to_rows
 
 if TYPE_CHECKING:
@@ -91,7 +97,7 @@ def observations(
         unmapped=unmapped,
         temperature=_column(ds, TEMPERATURE) if TEMPERATURE in ds else None,
         depth=_column(ds, "depth") if "depth" in ds else None,
-        map_sigma=None if grid is None else grid_sigma(grid),
+        map_sigma=None if grid is None else hypot(grid_sigma(grid), variation_level_sigma(ds)),
         origin=origin,
         sensor=str(ds.attrs.get("sensor", "")),
         model=model,
