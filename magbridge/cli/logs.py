@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from functools import partial
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -295,6 +295,7 @@ def map(  # noqa: A001 - the command's name
     plot
         A PNG, PDF or SVG to write, with a map of every step.
     """
+    from magbridge.diagnostics import Diagnostic
     from magbridge.field.continuation import draw_steps, prepare, surveyed_at
     from magbridge.field.read import read_grid, read_polygon
 
@@ -304,6 +305,8 @@ def map(  # noqa: A001 - the command's name
         flown = [read_grid(path) for path in grids]
         if survey_altitude:
             flown = surveyed_at(flown, survey_altitude)
+        if len(flown) > 1 and not any(isfinite(grid.altitude) for grid in flown):
+            cli.complain_all([Diagnostic("unknown_heights")])
         result, steps = prepare(flown, altitude, smooth, polygon, spacing)
     result.save(output)
     if plot:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 
 from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.continuation import (
@@ -142,6 +143,15 @@ def test_a_survey_of_unknown_height_is_not_continued_until_it_is_declared() -> N
     assert np.abs(off).max() < 0.1 * np.abs(monopole(60.0) - monopole(90.0)).max()
     with pytest.raises(WrongUse, match="2 altitudes for 1 grids"):
         surveyed_at([silent], [60.0, 70.0])
+
+
+def test_grids_of_unknown_heights_are_not_merged_in_silence(here: Path, command: Command) -> None:
+    for name in ("low.nc", "high.nc"):
+        AnomalyGrid(LON, LAT, monopole(90.0)).save(name)
+    said = "no grid says how high it was surveyed"
+    assert said in command("map", "low.nc", "high.nc", "-o", "map.nc").err
+    assert said not in command("map", "low.nc", "-o", "map.nc").err
+    assert said not in command("map", "low.nc", "high.nc", "--survey-altitude", "90", "-o", "map.nc").err
 
 
 def test_merge_is_the_mean_in_the_overlap() -> None:
