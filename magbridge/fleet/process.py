@@ -19,6 +19,7 @@ from typing import NamedTuple
 import dask
 import numpy as np
 import xarray as xr
+from dask.utils import parse_bytes
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 from threadpoolctl import threadpool_limits
 
@@ -29,7 +30,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, counts_from_boot, require
 from magbridge.correction import Correction
 from magbridge.diagnose.run import diagnose
-from magbridge.errors import DataError, FormatError, MagbridgeError, PortError, WriteError
+from magbridge.errors import DataError, FormatError, MagbridgeError, PortError, WriteError, WrongUse
 from magbridge.files import digest
 from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.learn import packed
@@ -224,14 +225,24 @@ SCHEDULER_TIMEOUT = "20s"
 """Longest time to wait for a connection to a scheduler."""
 
 
+MIN_MEMORY = 100e6
+"""Smallest memory of a worker, bytes; with less, none would start."""
+
+
 @contextmanager
 def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
     """Yield a client of the dask scheduler at an address, or of new local processes if it is empty.
 
     `workers` is the number of local processes, `memory` the limit of each, such as ``4 GiB``.
 
-    PortError: the scheduler does not answer.
+    WrongUse: `memory` is not an amount, or less than 100 MB. PortError: the scheduler does not answer.
     """
+    try:
+        enough = parse_bytes(memory) >= MIN_MEMORY
+    except ValueError:
+        enough = False
+    if not enough:
+        raise WrongUse(f'--memory: expected an amount of at least 100 MB, such as "4 GiB", got {memory!r}')
     for name in ("distributed", "distributed.client"):  # faults are raised as errors, too
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler:

@@ -17,13 +17,13 @@ from fleets import catalogue_of, content, fly
 from machine import full_disk
 
 from magbridge.calibration.file import decode_calibration, load
-from magbridge.errors import WriteError
+from magbridge.errors import WriteError, WrongUse
 from magbridge.field.grid import AnomalyGrid
 from magbridge.fleet.catalogue import FolderCatalogue
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.memory import lessons
 from magbridge.fleet.page import PAGE_COLOURS
-from magbridge.fleet.process import work
+from magbridge.fleet.process import client_of, work
 from magbridge.fleet.register import (
     Deployment,
     Vehicle,
@@ -289,3 +289,12 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
         for log in logs:
             assert "written by magbridge" in log.attrs.pop("history")  # with its time
         xr.testing.assert_identical(*logs)
+
+
+@pytest.mark.parametrize("memory", ["lots", "4", "-1 GiB"])
+def test_a_worker_needs_an_amount_of_memory(memory: str) -> None:
+    with (
+        pytest.raises(WrongUse, match="--memory: expected an amount of at least 100 MB"),
+        client_of("", 1, memory),
+    ):
+        pass
