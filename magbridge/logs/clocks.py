@@ -122,6 +122,12 @@ class TimeFormat(NamedTuple):
             return "seconds since 1970"
         return f"a time as {self.kind}" if self.is_text and self.kind != "iso" else "a time"
 
+    @property
+    def unambiguous(self) -> str:
+        """Return the expected content of a cell whose local time is at a change of summer time."""
+        change = f"a time that {self.zone} has once, not one at a change of summer time"
+        return f"{change} (write the times in UTC, or with their offset, as +01:00)"
+
 
 class CountState(NamedTuple):
     """State of times from an unknown start while a file is read, with the shift for wraps and restarts."""

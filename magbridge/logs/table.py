@@ -206,7 +206,13 @@ class TableReader:
         times[times == self._fill] = np.nan
         times += self._start
         self.faults.count("time", len(times))
-        self.faults.note("time", wrong, numbers, f"expected {self._clock.expected}", column.to_numpy())
+        if self._clock.zone and wrong.any():  # is it the zone that leaves them open?
+            twice = wrong & np.isfinite(seconds(self._clock._replace(zone=None), column))
+            self.faults.note("time", twice, numbers, f"expected {self._clock.unambiguous}", column.to_numpy())
+            unread = wrong & ~twice
+        else:
+            unread = wrong
+        self.faults.note("time", unread, numbers, f"expected {self._clock.expected}", column.to_numpy())
         return times, wrong
 
     def _past_midnights(self, frame: pd.DataFrame, times: FloatArray) -> FloatArray:

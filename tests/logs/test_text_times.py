@@ -191,6 +191,16 @@ def test_a_zone_may_be_declared(tmp_path: Path) -> None:
     assert float(read(tmp_path, text, columns=tmp_path / "columns.toml")["time"][0]) == NOON
 
 
+@pytest.mark.parametrize("row", ["2026-10-25 02:30:00", "2026-03-29 02:30:00"])
+def test_a_local_time_at_a_change_of_summer_time_is_named_as_such(tmp_path: Path, row: str) -> None:
+    """It occurs twice or never; with its offset it can be read."""
+    (tmp_path / "columns.toml").write_text('zone = "Europe/Berlin"\n')
+    columns = tmp_path / "columns.toml"
+    with pytest.raises(FormatError, match=r"expected a time that Europe/Berlin has once, .*in UTC"):
+        read(tmp_path, f"time,mag_x\n{row},1\n", columns=columns)
+    assert len(read(tmp_path, f"time,mag_x\n{row}+01:00,1\n", columns=columns)["time"]) == 1
+
+
 @settings(max_examples=30, deadline=None)
 @given(
     times=st.lists(st.integers(0, 4_000_000_000_000), min_size=1, max_size=8, unique=True).map(sorted),
