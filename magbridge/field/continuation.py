@@ -114,9 +114,11 @@ def _outside_sigma(grid: AnomalyGrid, height: float) -> FloatArray:
     """
     spacing, hole = _spacing(grid), np.isnan(grid.anomaly)
     values = filled(grid.anomaly)
+    # Edges: independent errors of the four sides add.
     north = _edge_variance(values, spacing, height)
     east = _edge_variance(values.T, spacing[::-1], height)
     variance = (north + north[::-1])[:, None] + east + east[::-1]
+    # Holes: the weight of unknown nodes is the continued mask; the error is that at the edge's distance of w.
     unknown = _moved(hole.astype(float), spacing, -abs(height))
     for step, measured in zip(spacing, (north, east), strict=True):
         w = 0.5 - np.arctan((np.arange(measured.size) + 0.5) * step / abs(height)) / np.pi
@@ -129,13 +131,14 @@ def _edge_variance(values: FloatArray, spacing: tuple[float, float], height: flo
 
     It is measured on the map itself: a part that ends at a cut is continued and compared with the whole.
     """
+    # The part without the rows beyond a cut has the error of an edge there.
     whole = _moved(values, spacing, height)
     squares, count = np.zeros((2, len(values)))
-    for side in (1, -1):
-        for n in (int(part * len(values)) for part in CUTS):
-            error = _moved(values[::side][:n], spacing, height) - whole[::side][:n]
-            squares[:n] += (error[::-1] ** 2).mean(axis=1)
-            count[:n] += 1.0
+    for n in (int(part * len(values)) for part in CUTS):  # on the other side of a cut, the error is opposite
+        error = _moved(values[:n], spacing, height) - whole[:n]
+        squares[:n] += (error[::-1] ** 2).mean(axis=1)
+        count[:n] += 1.0
+    # Beyond the longest part, the error at its far end.
     reach = int(np.count_nonzero(count))
     return np.asarray((squares / np.maximum(count, 1.0))[np.minimum(np.arange(len(values)), reach - 1)])
 

@@ -332,6 +332,7 @@ def _level_sigma(time: FloatArray, variation: FloatArray) -> float:
     autocovariance = np.fft.irfft(power)[:size]
     positive = autocovariance[: int((autocovariance <= 0.0).argmax()) or size]
     independent = size * autocovariance[0] / (2.0 * positive.sum() - autocovariance[0] or 1.0)
+    # The mean's variance, and that of the daily variation in the part of a day that is not recorded.
     unseen = max(1.0 - (time[-1] - time[0]) / DAY_S, 0.0)
     return float(np.sqrt(variation.var() / max(independent - 1.0, 1.0) + unseen * DAILY_RANGE_NT**2 / 8.0))
 
