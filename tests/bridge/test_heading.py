@@ -160,6 +160,8 @@ def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stac
     if stack == PX4:
         assert sqrt(covariance[20]) == pytest.approx(sigma, rel=1e-5)
         assert all(np.isfinite(covariance))
+        unknown = [sqrt(covariance[k]) for k in (0, 6, 11, 15, 18)]  # of x, y, z, roll and pitch
+        assert min(unknown) >= 100.0
     else:
         squares = covariance[15] ** 2 + covariance[18] ** 2 + covariance[20] ** 2
         assert np.cbrt(squares) == pytest.approx(sigma, rel=1e-5)

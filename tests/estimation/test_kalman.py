@@ -1,8 +1,10 @@
 """Test the Kalman filter against least squares, and the sequential test against densities of scipy."""
 
 import numpy as np
+import pytest
 from scipy.stats import multivariate_normal
 
+from magbridge.arrays import IndexArray
 from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.sequential import SequentialTest
 from magbridge.estimation.track_process import Course, TrackProcess
@@ -41,15 +43,17 @@ def test_considered_state_keeps_its_mean_and_its_uncertainty() -> None:
     assert kalman.covariance[0, 0] > 2.5, "the other state is known no better than the considered one"
 
 
-def test_prediction_of_some_states_is_that_of_the_whole_transition() -> None:
+@pytest.mark.parametrize("states", [np.array([1, 3]), slice(1, 3), None])
+def test_prediction_of_some_states_is_that_of_the_whole_transition(states: IndexArray | slice | None) -> None:
     rng = np.random.default_rng(2)
+    moved = np.arange(5)[slice(None) if states is None else states]
     A = rng.normal(size=(5, 5))
-    part, states = rng.normal(size=(2, 2)), np.array([1, 3])
-    whole = np.eye(5)
-    whole[np.ix_(states, states)] = part
+    part, root = rng.normal(size=(2, len(moved), len(moved)))
+    whole, noise = np.eye(5), np.zeros((5, 5))
+    whole[np.ix_(moved, moved)], noise[np.ix_(moved, moved)] = part, root @ root.T
     kalman = KalmanFilter(rng.normal(size=5), A @ A.T)
-    mean, covariance = whole @ kalman.mean, whole @ kalman.covariance @ whole.T
-    kalman.predict(part, states=states)
+    mean, covariance = whole @ kalman.mean, whole @ kalman.covariance @ whole.T + noise
+    kalman.predict(part, root @ root.T, states)
     np.testing.assert_allclose(kalman.mean, mean)
     np.testing.assert_allclose(kalman.covariance, covariance, atol=1e-12)
 
