@@ -10,7 +10,9 @@ import pytest
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.calibration.model import Noise
 from magbridge.health import HealthMonitor
+from magbridge.health.checks import Messages
 from magbridge.health.consistency import Sensitivity
+from magbridge.health.scatter import Scatter
 from magbridge.records import Quality
 
 IMPLAUSIBLE, MOVING = int(Quality.IMPLAUSIBLE), int(Quality.MOVING)
@@ -360,3 +362,19 @@ def test_memory_and_state_do_not_grow() -> None:
         total = float(np.linalg.norm(raw)), SIGMA
         judge.check(k * PERIOD_US, raw, raw, total, 0, (FIELD, 145.0), nan, 0.0, Sensitivity)
     assert len(judge.messages) <= 5
+
+
+def test_one_jump_of_the_position_is_no_speed_and_two_in_a_row_are() -> None:
+    scatter = Scatter(Noise(1.0), Messages())
+
+    def speed_after(minute: int, metres: float) -> float:
+        scatter.set_position(minute * 60_000_000, 48.0 + metres / 111_200.0, -57.0)
+        return scatter.speed
+
+    speeds = [speed_after(minute, 60.0 * minute) for minute in range(60)]
+    assert speeds[-1] == pytest.approx(1.0, rel=0.01)
+    jumped = [speed_after(minute, 60.0 * minute + 5_400.0) for minute in range(60, 90)]  # as at a fix
+    assert jumped == pytest.approx([1.0] * 30, rel=0.01)
+    assert [speed_after(minute, 600.0 * minute) for minute in range(90, 93)][-1] == pytest.approx(
+        10.0, rel=0.01
+    )
