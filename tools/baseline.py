@@ -198,7 +198,7 @@ PARTS = (
 
 def goal_of(name: str) -> str:
     """Return the direction in which the figure `name` improves."""
-    if "normalised" in name:
+    if "normalised" in name or "scale" in name:
         return ONE
     return HIGH if any(word in name for word in ("found", "alone", "valid", "among")) else LOW
 
