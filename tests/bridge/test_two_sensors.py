@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from devices import open_line, udp_socket
 from fed import FedBridge, named
+from msgspec.structs import replace
 from small import START, aligned, polynomial
 
 from magbridge.bridge import events
@@ -21,12 +22,14 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration
 from magbridge.calibration.scalar import (
     PLATFORM_TERMS,
+    ScalarChannel,
     ScalarNoise,
     ScalarSensor,
     ScalarSeries,
     correct_scalar,
 )
 from magbridge.config import load
+from magbridge.errors import ConfigError
 from magbridge.logs import read
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality
@@ -176,6 +179,25 @@ def test_the_learner_does_not_use_samples_that_another_sensor_contradicts(
     monkeypatch.setattr(learner, "sample", lambda *_, **values: faulty.append(values["faulty"]))
     bench.turn(jump_at + 200, 1, jump_at)
     assert set(faulty[-100:]) == {not is_used}
+
+
+def test_a_scalar_needs_the_current_of_its_compensation(tmp_path: Path) -> None:
+    size = PLATFORM_TERMS + 4
+    needy = replace(
+        scalar(),
+        channels=(ScalarChannel("motor", 5.0, (0.0, 10.0), 0.0, 10.0, "A"),),
+        coefficients=(0.0,) * size,
+        covariance=tuple(map(tuple, np.eye(size).tolist())),
+        prior_sigma=(30.0,) * size,
+    )
+    columns = '["total_field", "time"]'
+    with pytest.raises(ConfigError, match=r"telemetry\.motor: missing"):
+        Bench(tmp_path, "tail", columns, "", needy)
+    motor = '[telemetry.motor]\nmessage = "NAMED_VALUE_FLOAT"\nfield = "value"\nunit = "'
+    with pytest.raises(ConfigError, match="expected 'A'"):
+        Bench(tmp_path, "tail", columns, "", needy, more=motor + 'deg"\n')
+    Bench(tmp_path, "tail", columns, "", needy, more=motor + 'A"\n')
+    Bench(tmp_path, "tail", columns, "")  # no calibration has the scalar: it is sent as read
 
 
 def test_a_scalar_is_compensated_by_the_vector_of_its_time(tmp_path: Path) -> None:
