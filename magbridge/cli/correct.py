@@ -167,15 +167,12 @@ def _corrected(
     DataError: no row of the log has all channels.
     """
     from magbridge.field.reference import missing_anomaly
-    from magbridge.logs.info import missing_depth
     from magbridge.rows import correct_rows
 
     correction, whole, lack = None, False, ""
     for part in parts:
         if correction is None:
             cli.note_missing(known, part)
-            if shallow := missing_depth(part):
-                cli.complain(f"{part.attrs['source']}: {shallow}")
             correction = mb.Correction(known, learner=_learner(known, part, learn) if learn else None)
         if not lack and (lack := missing_anomaly(part)):
             cli.complain(f"{part.attrs['source']}: {lack}")

@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import xarray as xr
 
-from magbridge.columns import counts_from_boot, decoded, require
+from magbridge.columns import counts_from_boot, decoded, require, usual
 from magbridge.datasets import in_standard_units, increasing
 from magbridge.errors import FormatError, WriteError, WrongUse
 from magbridge.files import atomic_path, existing
@@ -160,6 +160,7 @@ class _Files:
         """Return the deployment with attributes that count and name the files skipped since the last call."""
         lines = [str(error) for error in self._bad.values()][self._reported :]
         self._reported += len(lines)
+        dataset = _without_depth(dataset)
         return with_losses(dataset, {"files_skipped": len(lines)}, lines) if lines else dataset
 
 
@@ -255,6 +256,25 @@ def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]
         else:
             yield piece, range(row, row + piece.sizes["time"])
             row += piece.sizes["time"]
+
+
+METRES_OF_WATER = {"dbar": 0.99, "bar": 9.9}
+"""Depth in sea water, m, for each unit of pressure, within 0.5 % down to 2,000 m (UNESCO 1983)."""
+
+
+def _without_depth(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the deployment with a note if it has positions and a pressure, but no depth."""
+    if "depth" in dataset or "latitude" not in dataset:
+        return dataset
+    for name, column in dataset.data_vars.items():
+        if (unit := usual(str(column.attrs.get("units", "")))) in METRES_OF_WATER:
+            remedy = f'[columns.depth] of columns.toml, from = "{name}", unit = "m", '
+            note = (
+                f"{dataset.attrs['source']}: no depth: taken as 0 m; if {name} is the water's: "
+                f"{remedy}scale = {METRES_OF_WATER[unit]:g}"
+            )
+            return dataset.assign_attrs({NOTES: "\n".join([*noted(dataset.attrs), note])})
+    return dataset
 
 
 def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:

@@ -50,8 +50,6 @@ CONDITION_UNITS = {"degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar"}
 """Units of temperatures and pressures."""
 STATES = {*(*CONDITION_UNITS, "inHg", "V", "s", "m", "m/s", "nT", "arcmin")}
 """Units of quantities that do not move iron or drive currents: temperatures, pressures, voltages, speeds."""
-METRES_OF_WATER = {"dbar": 0.99, "bar": 9.9}
-"""Depth in sea water, m, for each unit of pressure, within 0.5 % down to 1,000 m (UNESCO 1983)."""
 
 
 def info(log: xr.Dataset) -> dict[str, Any]:
@@ -169,19 +167,6 @@ def _column(name: str, column: xr.DataArray, time: FloatArray) -> dict[str, Any]
     }
 
 
-def missing_depth(log: xr.Dataset) -> str:
-    """Return that a log's pressure does not count as its depth, with the remedy; "" without a need."""
-    if "depth" in log and log["depth"].notnull().any():
-        return ""
-    for name, column in log.data_vars.items():
-        if (unit := usual(str(column.attrs.get("units", "")))) in METRES_OF_WATER:
-            remedy = f'from = "{name}", unit = "m", scale = {METRES_OF_WATER[unit]:g}'
-            return (
-                f"no depth: taken as 0 m; if {name} is the water's: [columns.depth] of columns.toml, {remedy}"
-            )
-    return ""
-
-
 def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     hints = []
     if set(CHANNELS) <= set(log.data_vars):
@@ -202,8 +187,6 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
-    if lack := missing_depth(log):
-        hints.append(lack)
     depth = log["depth"].dropna("time").to_numpy() if "depth" in log else np.empty(0)
     heights = [one["name"] for one in columns if HEIGHT_NAME.fullmatch(bare(one["name"]))]
     if "depth" not in log and heights:

@@ -15,7 +15,7 @@ from magbridge.cli.common import app
 from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment as made
-from magbridge.logs.info import USES, info, missing_depth, movers
+from magbridge.logs.info import USES, info, movers
 
 START = 1.6e9
 
@@ -87,18 +87,6 @@ def test_implausible_values_are_questioned(columns: dict[str, float], about: str
     found = [line for line in info(log)["hints"] if about in line and "never known" not in line]
     assert len(found) == bool(hint)
     assert all(hint in line for line in found)
-
-
-def test_a_pressure_is_not_taken_for_a_depth_in_silence() -> None:
-    values = {"total_field": np.full(9, 5e4), "pressure": np.linspace(0.0, 1_000.0, 9)}
-    log = made("log", START + np.arange(9.0), values)
-    log["pressure"].attrs["units"] = "dbar"
-    said = "no depth: taken as 0 m; if pressure is the water's"
-    assert [line for line in info(log)["hints"] if line.startswith(said) and line.endswith("scale = 0.99")]
-    assert missing_depth(log.assign(depth=("time", np.full(9, np.nan)))).startswith(said)
-    assert missing_depth(log.assign(depth=("time", np.zeros(9)))) == ""
-    log["pressure"].attrs["units"] = "hPa"  # of the air
-    assert missing_depth(log) == ""
 
 
 def test_what_moves_the_field_is_not_a_state_of_the_vehicle() -> None:

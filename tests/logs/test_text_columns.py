@@ -373,6 +373,21 @@ def test_a_height_is_the_opposite_of_the_depth(heading: str, tmp_path: Path) -> 
         assert not [hint for hint in info(log)["hints"] if "depth" in hint]
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("dbar", "0.99"), ("bar", "9.9"), ("hPa", "")])
+def test_a_pressure_is_not_the_depth_and_a_note_says_so(unit: str, scale: str, tmp_path: Path) -> None:
+    """The note's remedy gives the depth: 198 m at 200 dbar. Air pressure, in hPa, gets no note."""
+    text = lines(f"time,latitude,longitude,press [{unit}]", lambda k: f"{NOON + k},45.0,-75.0,200")
+    notes = read(tmp_path, text).attrs.get("notes", "")
+    assert ("no depth: taken as 0 m; if press is the water's" in notes) == bool(scale)
+    if scale:
+        assert notes.endswith(f'from = "press", unit = "m", scale = {scale}')
+        remedy = notes.partition("columns.toml, ")[2].replace(", ", "\n")
+        (tmp_path / "columns.toml").write_text(f"[columns.depth]\n{remedy}\n")
+        log = read(tmp_path, text, columns=tmp_path / "columns.toml")
+        assert log["depth"].values == pytest.approx([200.0 * float(scale)] * 40)
+        assert "notes" not in log.attrs
+
+
 def test_a_height_beside_a_depth_or_without_positions_is_telemetry(tmp_path: Path) -> None:
     """An underwater vehicle's altitude is its distance from the seabed."""
     text = lines("time,latitude,longitude,depth,altitude [m]", lambda k: f"{NOON + k},45.0,-75.0,20,8")
