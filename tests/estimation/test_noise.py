@@ -52,6 +52,20 @@ def test_memory_is_believed_from_three_standard_errors_on() -> None:
     assert estimate_noise(weak, STEPS, 0.0).autocorrelation == pytest.approx(rho, abs=0.01)
 
 
+def test_samples_beside_a_motion_have_a_variance_of_their_own() -> None:
+    moving = np.arange(N) % 20 < 2
+    e = drawn(0.0) * np.where(moving, 10.0, 1.0)
+    e[[0, 1]] = 400.0, -100.0  # in motion: beyond and within five of its own 1-sigmas of 40 nT
+    e[5] = 30.0  # at rest, with 4 nT
+    noise = estimate_noise(e, STEPS, 0.0, moving=moving)
+    assert noise.weight is not None
+    assert noise.sigma == pytest.approx(4.0, rel=0.05)
+    assert np.flatnonzero(noise.weight == 0.0).tolist() == [0, 5]
+    assert noise.weight[moving][1:] == pytest.approx(0.01, rel=0.2)
+    # where motion adds no error, all samples count alike
+    assert estimate_noise(drawn(0.0), STEPS, 0.0, moving=moving).root_weights(N).min() > 0.95
+
+
 def test_a_few_pairs_of_wrong_samples_do_not_count_as_memory() -> None:
     e = drawn(0.0)
     for k in range(100, 100 + 200 * 10, 200):
