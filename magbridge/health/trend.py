@@ -13,8 +13,9 @@ bound of q, which adapts to the normalised innovations. The second term of Q mod
 calibration's error while the direction of the field turns by :math:`|\Delta u|`.
 
 A sample whose innovation exceeds :data:`GATE_SIGMA` is an outlier (section 5.4 of the same book). Three
-outliers that agree with each other are a jump. Samples after a jump are flagged until the sum of the jumps is
-zero again. Sigma includes the largest jump, also for a while after the field has returned.
+outliers that agree with each other are a jump. Samples after a jump are flagged until the field has returned:
+the sum of the jumps is zero, or the level is again that before the jumps. Sigma includes the largest jump,
+also for a while after the return.
 
 Telemetry reports a motion after the motion has begun. The filter then returns to its state before the motion,
 so that it does not count the effect of the motion as a jump.
@@ -56,6 +57,12 @@ BURST_DECAY: Final = 0.8
 BURST_SAMPLES: Final = 8
 """Fraction of an outlier's square that is added to the next sample's variance: after a spike, and in a burst.
 Outliers less than BURST_SAMPLES samples apart are a burst."""
+RETURN: Final = 4.0
+EVIDENT: Final = 16.0
+"""Normalised square of the distance from the level before the jumps up to which the field has returned, and
+square of the smallest ratio of a jump to this distance: a smaller jump does not show a return."""
+CAUTION: Final = 0.75
+"""Factor for the size of the jump if the return is gradual, because a drifting level may pass that before."""
 LASTING_US: Final = 120_000_000
 """Duration above which a jump counts as lasting, µs."""
 TREND_HOLD_US: Final = 60_000_000
@@ -107,6 +114,8 @@ class TrendCheck:
         self._accepted = 0
         self._unrest, self._decay, self._quiet = 0.0, SPIKE_DECAY, BURST_SAMPLES
         self._candidate, self._agreed, self._candidate_us = nan, 0, 0
+        self._home: TrendState | None = None  # prediction at which the field left its level
+        self._away_us = NEVER  # time at which the field was last seen not to be back there
 
     @property
     def is_established(self) -> bool:
@@ -133,7 +142,7 @@ class TrendCheck:
 
         `total` and `sigma` are the corrected total field and the part of its 1-sigma that is not common to
         all samples, nT; `turned` is the change of the field's direction since the last sample, rad. Without
-        `learn`, the sample cannot begin a trend or be part of a jump.
+        `learn`, the sample does not change the trend.
         """
         self.is_outlier = False
         scatter, now = self._scatter, self._now
@@ -158,6 +167,9 @@ class TrendCheck:
         S = p_level + noise
         e = total - level
         scatter.follow(time_us, total)
+        if not learn:  # a field that is known to be wrong would become the level, and its end a jump
+            self.is_outlier = e * e > GATE * S
+            return e * e if self.is_outlier else 0.0
         # now[6:] keeps the jumps so far; _replace would take twice as long
         if e * e <= GATE * S:
             # a sample accepted only because of a turn or a motion may still be an outlier
@@ -173,7 +185,7 @@ class TrendCheck:
             return self._accept(self._now, e * e / S, sigma, noise)
         if self._accepted < AGREEING:
             # which of the first samples is the outlier is not known
-            if self.has_moved and learn:
+            if self.has_moved:
                 self._jump(time_us, e, noise)
             self._begin(time_us, total, sigma, noise)
             self._accepted = 0
@@ -184,8 +196,7 @@ class TrendCheck:
         self._decay = BURST_DECAY if self._quiet < BURST_SAMPLES else SPIKE_DECAY
         self._quiet = 0
         self.is_outlier = True
-        if learn:
-            self._agree(time_us, total, sigma, S, noise)
+        self._agree(time_us, total, sigma, S, noise)
         return e * e
 
     def _accept(self, state: TrendState, square: float, sigma: float, noise: float) -> float:
@@ -252,6 +263,8 @@ class TrendCheck:
         """Shift the level by `difference` (nT), by which a new calibration changes the total field."""
         if self._now is not None:
             self._now = self._now._replace(level=self._now.level + difference)
+        if self._home is not None:
+            self._home = self._home._replace(level=self._home.level + difference)
         self._candidate += difference
         self._checkpoints.clear()
 
@@ -265,17 +278,21 @@ class TrendCheck:
         since_us, until_us = now.since_us, now.until_us
         # the time since the field left its level decides how long sigma includes the jump
         if now.jump_sum * now.jump_sum <= largest_zero:
-            since_us = time_us
+            since_us, self._home = time_us, now
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
         # a jump equal to the sum so far: the return in between was missed, at a motion or a turn
         if jump * now.jump_sum > largest_zero and (jump - now.jump_sum) ** 2 <= 2.0 * largest_zero:
             total = jump
+        slope = now.slope
+        if self._home is not None and self._is_return(now, jump, total, noise):
+            total, slope = 0.0, self._home.slope
         # a jump at a motion recurs at the next motion, so sigma includes it for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
         self._now = now._replace(
+            slope=slope,
             jump_sum=total,
             largest=max(now.largest, abs(total), abs(jump)),
             jumps=now.jumps + 1,
@@ -288,6 +305,29 @@ class TrendCheck:
         else:
             self._messages.report("jump", f"field jumps by {jump:+.0f} nT, which no telemetry explains")
 
+    def _is_return(self, state: TrendState, jump: float, total: float, noise: float) -> bool:
+        """Return True if a `jump` (nT) from `state` ends the jumps, whose sum is then `total`, nT."""
+        # change of the level since the jump; if it is more than natural, the disturbance has changed, and
+        # only the level shows the return; else the sum of the jumps shows it with a smaller error
+        drift, P = self._from_home(state, state.level - state.jump_sum)
+        if drift * drift <= P:
+            return _is_at(total, noise + 2.0 * state.p_level, jump)
+        return _is_at(drift + total, P, jump)
+
+    def _from_home(self, state: TrendState, level: float) -> tuple[float, float]:
+        """Return the difference of `level` (nT) from that before the jumps, and its variance, nT²."""
+        home = self._home
+        assert home is not None
+        T = 1e-6 * (state.time_us - home.time_us)
+        q = exp(self._min_log_q)
+        # natural change since then: of the trend, or of a crustal field at the speed that has this q,
+        # sigma_c^2 3 (v T / l)^2, and at most 2 sigma_c^2
+        trend = home.p_level + T * (2.0 * home.p_cross + T * home.p_slope) + q * T * T * T / 3.0
+        way = 3.0**0.5 / CRUST_LENGTH_M * (q / CURVATURE_PER_SPEED_CUBED) ** (1.0 / 3.0) * T
+        crust = MAIN_FIELD_SIGMA_NT**2 * min(way * way, 2.0)
+        change, P = (T * home.slope, trend) if trend < crust else (0.0, crust)
+        return level - home.level - change, P + self._scatter.variance + 2.0 * self._sigma**2
+
     def jump_variance(self, time_us: int) -> float:
         """Set :attr:`is_away`; return the variance (nT²) that past jumps add to a sample."""
         self.is_away = False
@@ -296,6 +336,14 @@ class TrendCheck:
             return 0.0
         # the field has returned if the sum of the jumps is zero up to the noise
         self.is_away = now.jump_sum * now.jump_sum > GATE * self._scatter.variance
+        if self.is_away and self._home is not None:
+            # a gradual return: for a while at the level before the jumps, with the slope of a crustal field
+            is_flat = now.slope * now.slope + now.p_slope <= RETURN * self._slope_variance
+            if not is_flat or not _is_at(*self._from_home(now, now.level), CAUTION * now.largest):
+                self._away_us = time_us
+            elif time_us - self._away_us >= TREND_HOLD_US:
+                self.is_away = False
+                self._now = now = now._replace(jump_sum=0.0)
         if not self.is_away and time_us >= now.until_us:
             self._now = now._replace(jump_sum=0.0, largest=0.0)
             return 0.0
@@ -306,3 +354,9 @@ class TrendCheck:
         if self._now is not None:
             self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=NEVER)
         self._checkpoints.clear()
+
+
+def _is_at(difference: float, variance: float, jump: float) -> bool:
+    """Return True if a `difference` is zero up to its `variance`, and a `jump` is large against its sigma."""
+    largest = RETURN * variance
+    return difference * difference <= largest and jump * jump > EVIDENT * largest

@@ -144,6 +144,50 @@ def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() ->
     assert (sigma[2000:] == SIGMA).all(), "after an hour at the latest"
 
 
+@pytest.mark.parametrize("speed", [0.35, 15.0])
+@pytest.mark.parametrize("reference", [FIELD, nan])
+@pytest.mark.parametrize(
+    ("disturbance", "seconds", "turn"),
+    [
+        (2000.0, 8, 0.0), (2000.0, 120, 0.0),
+        ((2000.0, 0.0, 0.0), 8, 2.0), ((600.0, 0.0, 0.0), 8, 5.0), ((2000.0, 0.0, 0.0), 16, 2.0),
+    ],
+    ids=["total", "total, long", "turning", "turning fast", "turning, longer"],
+)  # fmt: skip
+def test_a_disturbance_that_ends_is_forgotten(
+    disturbance: float | tuple[float, float, float],
+    seconds: int,
+    turn: float,
+    reference: float,
+    speed: float,
+) -> None:
+    """A vehicle with 10 samples a second turns by `turn` deg/s; the disturbance begins and ends at once."""
+    rng, judge, begin = np.random.default_rng(1), HealthMonitor(Noise(0.5)), 600
+    end = begin + 10 * seconds
+    time = 0.1 * np.arange(end + 4000)
+    yaw = np.radians(30.0 + turn * time)
+    unit = np.stack([0.4 * np.cos(yaw), -0.4 * np.sin(yaw), np.full(len(time), 0.84**0.5)], axis=1)
+    raw = (FIELD + 40.0 * np.sin(speed * time / 300.0))[:, None] * unit
+    truth = np.linalg.norm(raw, axis=1)
+    raw[begin:end] += along(raw[begin:end], disturbance) if isinstance(disturbance, float) else disturbance
+    raw += rng.normal(0.0, 0.5, raw.shape)
+    total = np.linalg.norm(raw, axis=1)
+    flags, sigma = [], []
+    for k, one in enumerate(raw.tolist()):
+        judge.set_position(k * 100_000, 48.0 + speed * time[k] / 111_200.0, -57.0)
+        variance = judge.check(
+            k * 100_000, one, one, (float(total[k]), SIGMA), 0, (reference, 145.0), nan, 0.0, Sensitivity
+        )
+        flags.append(judge.flags)
+        sigma.append((SIGMA**2 + variance) ** 0.5)
+    z = np.abs(total - truth) / sigma
+    assert all(flags[begin:end])
+    if seconds < 10 or np.isnan(reference):  # else the check of the level flags for an hour
+        assert not any(flags[end + 10 :])
+    assert max(sigma[end + 2500 :]) < 2.0 * SIGMA, "four minutes after the second jump"
+    assert z[np.array(flags) == 0].max() < 3.0
+
+
 def test_a_mass_that_moves_is_not_a_jump_if_the_field_stays_and_one_if_it_does_not() -> None:
     flight = Flight()
     flight.quality[695:705] = MOVING
