@@ -137,7 +137,8 @@ class Track:
     def value_at(self, time_us: int) -> tuple[float, float, float, float]:
         """Return the value at `time_us` (µs), its age (s), and two values that bound it during a motion.
 
-        Between two values the result is interpolated (age 0). After the last value, the last value is used.
+        Between two values the result is interpolated, and the age is 0. If they are farther apart than
+        ``max_age``, the age is the time to the nearer one. After the last value, the last value is used.
         Before the first value, the first value is used, and the age is the time until it was measured.
         """
         after_us, after = self.last_us, self.last
@@ -146,8 +147,9 @@ class Track:
             return after, (time_us - after_us) * 1e-6, low, high
         for then_us, value in reversed(self.history):
             if then_us <= time_us:
-                weight = (time_us - then_us) / (after_us - then_us)
-                return value + weight * (after - value), 0.0, value, after
+                weight, step = (time_us - then_us) / (after_us - then_us), (after_us - then_us) * 1e-6
+                age = min(weight, 1.0 - weight) * step if step > self.max_age else 0.0
+                return value + weight * (after - value), age, value, after
             after_us, after = then_us, value
         return after, (after_us - time_us) * 1e-6, after, after
 
@@ -307,6 +309,8 @@ class Aligner:
                 if track.input.is_mass:
                     quality |= MOVING  # or stopped less than settle_time ago
                     self.motion_since_us = min(self.motion_since_us, track.reported_before_us)
+            elif age and sample_us < track.last_us:  # between two values that are far apart
+                spans.append((index, low, high))
             if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
                 quality |= LATE_JOIN
             if undated:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import isfinite, nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from magbridge.datasets import expect, standard_log
 from magbridge.errors import FormatError
 from magbridge.field.igrf import HeldField, magnitude
 from magbridge.field.reference import main_field, other_units
-from magbridge.records import Quality, Reading
+from magbridge.records import NEVER, Quality, Reading
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 __all__ = ["correct_rows", "refuse_unsuited"]
 
+SAME_US: Final = 1000
+"""Difference of the times below which two rows hold the same report, µs: ages are rounded."""
+
 
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """Correct the rows of a deployment, or of its pieces in order, as the live bridge would.
@@ -39,6 +42,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     One flag is added that needs later telemetry, which a live bridge does not have: ``moving`` for the last
     sample before the telemetry reports a motion, if the telemetry of that sample is older than the sample. A
     motion that begins with the first row of a piece does not flag the last row of the previous piece.
+
+    Between two reports that are farther apart than ``max_age``, a parameter is interpolated, and sigma covers
+    both values. Its age is then the time to the nearer report.
 
     Parameters
     ----------
@@ -221,7 +227,10 @@ def _flag_onsets(results: FloatArray, age: FloatArray) -> None:
 
 
 def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[int, Reading, int]]:
-    """Yield each sample's row, reading and time (µs), after passing the telemetry so far to `correction`."""
+    """Yield each sample's row, reading and time (µs), after passing the telemetry so far to `correction`.
+
+    If the next report of a parameter comes later than its ``max_age``, this report is passed, too.
+    """
 
     def column(name: str) -> list[float]:
         return list(_column(deployment, name).tolist())
@@ -233,6 +242,10 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     ]
     wanted = [name for name in correction.aligner.by_name if name != TEMPERATURE]
     telemetry = [(name, column(name), column(AGE + name)) for name in wanted]
+    following = [
+        (name, correction.aligner.by_name[name], _following(stamps, values, ages))
+        for name, values, ages in telemetry
+    ]
     cycles = column("power_cycle")
     channels = zip(*(column(f"mag_{axis}") for axis in "xyz"), strict=True)
     rows = zip(stamps, channels, zip(*delays, strict=True), column(TEMPERATURE), cycles, strict=True)
@@ -242,6 +255,10 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
                 correction.telemetry(name, values[row], stamp - round(ages[row] * 1e6))
             elif isfinite(values[row]):  # an empty cell is not a message that the value is unknown
                 correction.telemetry(name, values[row], stamp)
+        for name, track, reports in following:
+            time_us, value = reports[row]
+            if time_us - track.last_us > track.max_age * 1e6 and isfinite(value) and not track.lacking:
+                correction.telemetry(name, value, time_us)
         if field[0] == field[0] or field[1] == field[1] or field[2] == field[2]:  # not all NaN
             power_cycle = int(cycle) if isfinite(cycle) else None
             yield (
@@ -251,3 +268,18 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
             )
         elif isfinite(temperature):  # of another log than the readings
             correction.telemetry(TEMPERATURE, temperature, stamp)
+
+
+def _following(stamps: list[int], values: list[float], ages: list[float]) -> list[tuple[int, float]]:
+    """Return time (µs) and value of the first report after that of each row; NaN without one."""
+    found = []
+    report = after = (NEVER, nan)
+    for stamp, value, age in zip(reversed(stamps), reversed(values), reversed(ages), strict=True):
+        if not isfinite(age) and not isfinite(value):  # the row has the report of an earlier row
+            found.append(report)
+            continue
+        time_us = stamp - round(age * 1e6) if isfinite(age) else stamp
+        if abs(report[0] - time_us) > SAME_US:
+            report, after = (time_us, value), report
+        found.append(after)
+    return found[::-1]

@@ -112,6 +112,36 @@ def test_a_mass_in_motion_was_somewhere_between(calibration: Calibration) -> Non
     assert corrected.total_field_sigma == pytest.approx(hypot(1.0, half), rel=1e-3)
 
 
+@pytest.mark.parametrize("interval", [20.0, 40.0, 60.0])
+@pytest.mark.parametrize("has_age", [False, True])
+@pytest.mark.parametrize("amplitude", [0.0, 0.3])
+def test_between_two_slow_reports_of_a_log_a_mass_was_between_them(
+    calibration: Calibration, interval: float, amplitude: float, *, has_age: bool
+) -> None:
+    """Telemetry is stale after 30 s; a whole log has the next report, too."""
+    time = 4.0 * np.arange(300)
+    reported = np.floor(time / interval) * interval
+
+    def position(t: np.ndarray) -> np.ndarray:
+        return np.asarray(0.2 + amplitude * np.sin(t / 100.0))
+
+    columns = {f"mag_{axis}": np.full(300, value) for axis, value in zip("xyz", FIELD, strict=True)}
+    columns["mag_x"] += LINE * position(time)
+    columns["battpos"] = position(reported)
+    if has_age:
+        columns["age_battpos"] = time - reported
+    else:
+        columns["battpos"][time - reported >= 4.0] = nan
+    found = correct_rows(Correction(calibration), deployment("slow.csv", 1.78e9 + time, columns))
+    found = found.isel(time=time < reported[-1])
+    if not amplitude:
+        assert not (found["quality"].to_numpy().astype(int) & Quality.STALE_TELEMETRY).any()
+        np.testing.assert_allclose(found["total_field_sigma"], 1.0, rtol=1e-3)
+    elif interval > 30.0:  # else the log is corrected as live
+        z = (found["total_field"] - hypot(*FIELD)) / found["total_field_sigma"]
+        assert float(np.sqrt((z**2).mean())) < 1.3
+
+
 def test_a_mass_at_rest_adds_nothing(calibration: Calibration) -> None:
     correction = Correction(calibration, Align(settle_time=1.0))
     for k in range(3):
