@@ -7,7 +7,7 @@ aligner subtracts this delay from the sample's time, and evaluates the telemetry
 If the process stalls, readings and telemetry wait in buffers. An input with a time stamp (of the instrument,
 or of the autopilot by TIMESYNC) keeps its time. Any other input may have been measured at any time during the
 stall. A sample with an input of unknown time is flagged ``late_join``, and its sigma covers all values that
-the parameters had during the stall.
+the parameters had during the stall. The same applies to a reading that may have waited before it arrived.
 """
 
 from __future__ import annotations
@@ -269,8 +269,8 @@ class Aligner:
             variance = inf
 
         sample_us = time_us + round(first * 1e6) - round(settings.filter_delay * 1e6)
-        undated = self.late_since_us != 0 and isnan(reading.device_time)
-        values, spans, age, more, growth = self._parameters(sample_us, undated)
+        since_us = self.late_since_us if isnan(reading.device_time) else 0
+        values, spans, age, more, growth = self._parameters(sample_us, since_us or reading.since_us)
         variance += growth
         sigma = variance**0.5 if variance else 0.0
         # the two low bits of a time belong to the log
@@ -278,17 +278,17 @@ class Aligner:
         return Sample(reading, time_of_all_us, field, values, age, quality | more, sigma, spans)
 
     def _parameters(
-        self, sample_us: int, undated: bool
+        self, sample_us: int, since_us: int
     ) -> tuple[tuple[float, ...], tuple[tuple[int, float, float], ...], float, int, float]:
         """Return values, spans, age, flags and variance (nT²) of the parameters at `sample_us` (µs).
 
-        An `undated` sample has no time stamp of its own and arrived after a stall.
+        `since_us`: earliest time at which the sample may have been measured, µs; 0 if its time is known.
         """
         late_us, settings = self.late_since_us, self.settings
         settle_us = settings.settle_time * 1e6
         values: list[float] = []
         spans: list[tuple[int, float, float]] = []
-        quality, variance, oldest = LATE_JOIN if undated else 0, 0.0, 0.0
+        quality, variance, oldest = LATE_JOIN if since_us else 0, 0.0, 0.0
         self.motion_since_us = sample_us
         for index, track in enumerate(self.tracks):
             if track.last_us == NEVER:
@@ -311,10 +311,10 @@ class Aligner:
                     self.motion_since_us = min(self.motion_since_us, track.reported_before_us)
             elif age and sample_us < track.last_us:  # between two values that are far apart
                 spans.append((index, low, high))
-            if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
+            if sample_us < track.first_us or (late_us and sample_us > track.last_us):
                 quality |= LATE_JOIN
-            if undated:
-                spans.append((index, *track.extremes_since(late_us)))
+            if since_us:
+                spans.append((index, *track.extremes_since(since_us)))
             elif track.guess_us[0] <= sample_us <= track.guess_us[1]:
                 quality |= LATE_JOIN
                 spans.append((index, *track.guess))

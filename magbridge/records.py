@@ -111,6 +111,8 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     """Time of `device_time` on the host's clock, µs since 1970 UTC, a multiple of 4; 0 until it is known."""
     missing: int = 0
     """Number of readings missing immediately before this reading."""
+    since_us: int = 0
+    """Earliest possible value of `time_us`, µs, if it is uncertain because readings waited; else 0."""
     restarted: bool = False
     """True if the instrument's clock restarted, because the instrument was powered on again."""
 

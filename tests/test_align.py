@@ -212,6 +212,15 @@ def test_what_waited_is_joined_with_the_telemetry_of_its_time(dated: bool, guess
     assert "late_join" not in flags(aligner.reading(reading(), end + SECOND))
 
 
+def test_a_reading_that_may_have_waited_is_joined_with_all_telemetry_since_then() -> None:
+    aligner = Aligner((BATTERY,), Align(moving_rate=100.0))
+    for k in range(9):
+        aligner.telemetry("battpos", START + k * SECOND, float(k >= 3))
+    sample = aligner.reading(reading(since_us=START + 2 * SECOND), START + 8 * SECOND)
+    assert flags(sample) == {"late_join"}
+    assert (0, 0.0, 1.0) in sample.spans
+
+
 def test_of_a_time_within_the_standstill_whose_telemetry_has_not_come_nothing_is_known() -> None:
     aligner = Aligner((BATTERY,), Align())
     aligner.telemetry("battpos", START, 0.0)

@@ -9,12 +9,17 @@ delay, a constant, remains as an error of the times.
 For an instrument without a clock but with a steady rate, the device time of reading n is ``n * period``. The
 slope of the line is then the error of the nominal period. If the configured rate is wrong, the readings
 arrive on a straight line with another period, which replaces the nominal period.
+
+Without a clock, a late reading can have two causes: readings before it were lost, or it waited. A loss lasts:
+all later readings are late by the same periods. Readings that waited arrive faster than the period. So a loss
+is a belief, which the next readings can refute; it is then taken back.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from copy import copy
 from itertools import islice
 from math import inf, isnan, nan
 from typing import Final, NamedTuple
@@ -37,13 +42,12 @@ TOLERANCE: Final = 20_000.0
 """Difference from the line that an arrival may have, µs."""
 INITIAL_DELAY_US: Final = 5_000.0
 """Mean delay before the first reading, µs."""
-STALL: Final = 100_000.0
-"""Limit to which longer delays are reduced in the mean delay, µs, because they are not typical."""
+DELAY_OUTLIER: Final = 2.0
+"""Multiple of the mean delay to which longer delays are reduced in the mean, because they are not typical."""
+MIN_OUTLIER_US: Final = 1_000.0
+"""Smallest delay that is reduced, µs."""
 WANDER: Final = 0.05
 """Smallest sigma of the slope as a fraction of its prior sigma, because rates change with temperature."""
-MAX_PHASE: Final = 0.25
-"""Largest mean remainder of the heights, as a fraction of the period, that is the mean delay. Remainders of
-longer delays are about half a period."""
 MARGIN: Final = 0.1
 """Largest error of the line, as a fraction of the period, where late readings differ from missing ones."""
 BOUND: Final = 5.0
@@ -53,9 +57,9 @@ BOUND: Final = 5.0
 class Floor:
     """Estimate of the straight line below the points (x, y), with x in s and y in µs.
 
+    `period_us`: time between the points, µs, if they are readings at a steady rate.
     `slope`, `slope_sigma`: slope of the line and its standard deviation, µs/s.
-    `period_us`: time between the points if they are readings at a steady rate, of which some may be lost, µs;
-        else 0.
+    `delay`: mean height of the points above the line, µs.
     `lowest`: lowest point (x, y) of the last complete block, or of the present one.
 
     Notes
@@ -69,10 +73,10 @@ class Floor:
     delay divided by the number of readings in a block, as for exponentially distributed delays.
     """
 
-    def __init__(self, slope_sigma: float, period_us: float = 0.0) -> None:
-        self._prior_sigma, self._period_us = slope_sigma, period_us
+    def __init__(self, slope_sigma: float, period_us: float = inf) -> None:
+        self._prior_sigma = slope_sigma
         self.slope = 0.0
-        self._delay = self._phase = INITIAL_DELAY_US
+        self.delay = min(INITIAL_DELAY_US, 0.25 * period_us)
         self.restart(0.0, 0.0)
 
     def restart(self, x: float, y: float) -> None:
@@ -92,18 +96,9 @@ class Floor:
         return self._y + self.slope * (x - self._x) + self._drop
 
     @property
-    def delay(self) -> float:
-        """Mean height of the points above the line, µs.
-
-        Uncounted losses raise all points by whole periods. So the mean is of the remainders of the heights
-        after division by the period, as long as these are short.
-        """
-        return self._phase if self._phase < MAX_PHASE * self._period_us else self._delay
-
-    @property
     def scatter(self) -> float:
         """Standard deviation of the lowest points of blocks, µs."""
-        return self.delay / self._size + 1.0
+        return self.delay / (self._size if self._points else max(self._count, 1)) + 1.0
 
     def tolerance(self, x: float) -> float:
         """Return the difference from the line (µs) that a point at `x` may have."""
@@ -117,12 +112,7 @@ class Floor:
         """
         if not self._count:
             self._began, self._least = x, inf
-        delay = above if 0.0 < above < STALL else max(0.0, min(above, STALL))
-        self._delay += (delay - self._delay) * 0.02
-        if period := self._period_us:
-            margin = MARGIN * period
-            remainder = max((max(above, 0.0) + margin) % period - margin, 0.0)
-            self._phase += (remainder - self._phase) * 0.02
+        self.note(above)
         if above < self._least:
             self._least, self.lowest = max(above, 0.0), (x, y)
             self._drop += min(above, 0.0)
@@ -134,16 +124,21 @@ class Floor:
             self._late_from = min(self._late_from, self._began)
             return self._least if x - self._late_from >= SPAN else 0.0
         self._late_from = inf
-        self._points.append(self.lowest)
+        self._points = [*self._points, self.lowest]  # a copy of the line keeps its own list
         if len(self._points) == LINE_POINTS:
             self._thin(x - self._began)
         self._fit()
         return 0.0
 
+    def note(self, above: float) -> None:
+        """Add the height of a point above the line, µs, to the mean delay only."""
+        outlier = max(DELAY_OUTLIER * self.delay, MIN_OUTLIER_US)
+        self.delay += (max(0.0, min(above, outlier)) - self.delay) * 0.02
+
     def _thin(self, duration: float) -> None:
         """Join blocks in pairs if the last lasted less than `SPAN` (`duration`, s); else drop the oldest."""
         if duration >= SPAN:
-            del self._points[0]
+            self._points = self._points[1:]
             return
         self._size *= 2
         pairs = zip(self._points[::2], self._points[1::2], strict=True)
@@ -272,6 +267,33 @@ KEEP_PHASE: Final = 3
 """Most missing readings in a row without a restart of the line; beyond, the instrument may have stopped."""
 
 
+USUAL: Final = 5.0
+"""Multiple of the mean delay up to which a delay is usual."""
+CERTAIN_DELAYS: Final = 15.0
+"""Multiple of the mean delay at which late readings are a loss: their smallest delay times their number. With
+exponential delays, that many readings wait that long with a probability of e^-12."""
+MIN_USUAL_US: Final = 6_000.0
+"""Smallest delay that is not usual, µs; a busy computer may delay a reading for some ms."""
+RUN: Final = 32
+"""Most late readings from which a loss is believed; more would include the next loss."""
+DOUBT: Final = 16
+"""Number of beliefs that can be refuted, and number of periods for which each can be."""
+
+
+class Belief(NamedTuple):
+    """Loss of readings that later readings may refute, and the state before it."""
+
+    beats: int
+    """Number of readings that are believed to be lost."""
+    arrival_us: int
+    """Arrival of the reading after the loss, µs."""
+    floor: Floor
+    least: float
+    """Smallest delay of the late readings without the loss, µs."""
+    out_us: int
+    """Time of the last reading before the late one, µs."""
+
+
 class DeviceClock:
     """Estimator of the times of an instrument's readings on the host's clock.
 
@@ -279,9 +301,10 @@ class DeviceClock:
     `sequence_modulo`: value at which the instrument's count of readings wraps to 0; 0 if it never wraps.
     `period`: time between the readings of an instrument without a clock, s; 0 if not steady, so that each
         reading gets the time of its arrival. A measured period replaces one that the readings contradict.
-    `invented`: number of readings that were reported as missing only because the period was wrong.
+    `invented`: number of readings that were reported as missing because the period was wrong, or because
+        later ones waited.
     `stepped`: True if one of the two clocks was set before the last reading, so that the relation between
-        the clocks is estimated again.
+        the clocks is estimated again, or if a loss was taken back. The time may then be before the last one.
     """
 
     def __init__(self, *, time_modulo: float = 0.0, sequence_modulo: int = 0, period: float = 0.0) -> None:
@@ -297,7 +320,10 @@ class DeviceClock:
         self._origin_us: int | None = None
         self._zero = self._turned = self._device_time = 0.0
         self._count = 0
-        self._arrival_us = self._out_us = 0
+        self._beliefs: deque[Belief] = deque(maxlen=DOUBT)
+        self._late: list[float] = []
+        self._least = inf
+        self._arrival_us = self._received_us = self._out_us = 0
         self.stepped = False
 
     @classmethod
@@ -311,6 +337,11 @@ class DeviceClock:
     def drift_ppm(self) -> float:
         """Rate of the host's clock minus the instrument's, µs/s."""
         return self._floor.slope
+
+    @property
+    def _limit_us(self) -> float:
+        """Return how far a reading may be below the line, µs, at a steady rate."""
+        return max(HALF * 1e6 * self._period, TOLERANCE)
 
     @property
     def rate(self) -> float:
@@ -346,12 +377,13 @@ class DeviceClock:
             updates the relation between the clocks.
         """
         limit_us, arrival_us, informative = arrival_us, arrival_us - (waited_us or 0), waited_us is None
-        device_time, sequence = reading.device_time, reading.sequence
+        device_time, sequence, self._received_us = reading.device_time, reading.sequence, limit_us
         if not abs(device_time) < MAX_DEVICE_TIME_S:
             device_time = nan
         timed = not isnan(device_time)
         missing = self._missing(sequence, arrival_us)
         restarted = stepped = False
+        since_us = 0.0
         if self._origin_us is None or timed == isnan(self._device_time):
             stepped = self._origin_us is not None
             self._begin(device_time, arrival_us)
@@ -361,7 +393,9 @@ class DeviceClock:
                 missing = self._missing_by_time(device_time)
             time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, informative)
         elif self._period:
-            time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, informative)
+            time_us, since_us, stepped, unseen = self._by_count(
+                arrival_us, self._origin_us, missing, informative
+            )
             missing += unseen
             time_us = min(time_us, limit_us)
         else:
@@ -373,7 +407,9 @@ class DeviceClock:
         if out_us <= self._out_us and not (stepped and self._out_us > limit_us + TOLERANCE):
             out_us = self._out_us + 4
         self._out_us, self.stepped = out_us, stepped
-        return replace(reading, time_us=out_us, missing=0 if restarted else missing, restarted=restarted)
+        missing = 0 if restarted else missing
+        since = min(int(since_us), out_us)
+        return replace(reading, time_us=out_us, missing=missing, restarted=restarted, since_us=since)
 
     def _missing(self, sequence: int | None, arrival_us: int) -> int:
         """Return the number of readings missing before the one with number `sequence`.
@@ -418,6 +454,8 @@ class DeviceClock:
         """Restart the estimate of the relation between the clocks from a reading."""
         self._origin_us = arrival_us
         self._zero, self._turned, self._count = device_time, 0.0, 0
+        self._beliefs.clear()
+        self._late, self._least = [], inf
         self._floor.restart(0.0, 0.0)
 
     def _by_time(
@@ -447,31 +485,45 @@ class DeviceClock:
 
     def _by_count(
         self, arrival_us: int, origin_us: int, missing: int, informative: bool
-    ) -> tuple[float, bool, int]:
-        """Return the host time (µs) by the count of readings, and True if it stepped back.
+    ) -> tuple[float, float, bool, int]:
+        """Return the host time (µs) by the count of readings, and its lower bound (µs) if it is uncertain.
 
-        Also return the number of missing readings in addition to `missing`, the number by sequence numbers.
+        Also return True if the time stepped back, and the number of missing readings in addition to
+        `missing`, the number by sequence numbers. The lower bound is 0 if the time is certain.
         """
-        floor, period_us = self._floor, 1e6 * self._period
+        period_us = 1e6 * self._period
         self._count += 1 + missing
         self._meter.skip(1 + missing)
-        x = self._count * self._period
-        y = arrival_us - origin_us - 1e6 * x
-        above = y - floor.value_at(x)
         if informative and (measured := self._meter.add(arrival_us, self._unseen, period_us)):
             self._period, self._floor = measured.period_us * 1e-6, Floor(SIGMA_PERIOD, measured.period_us)
             self._begin(nan, int(measured.time_us))
             self.invented += measured.invented
-            return measured.time_us, False, 0
+            return measured.time_us, 0.0, False, 0
+        taken_back = self._take_back(arrival_us, origin_us)
+        floor, x = self._floor, self._count * self._period
+        y = arrival_us - origin_us - 1e6 * x
+        value_us = floor.value_at(x)
+        above, since_us, late = y - value_us, 0.0, 0.0
         # no reading is sent after its arrival, so a reading late by less than a period proves no loss; the
         # margin covers the scatter of the line and its error since the last reading, because each reading
         # below the line lowers the line
         slope_error = 3.0 * floor.slope_sigma * self._period * (1 + missing)
         margin = min(8.0 * floor.scatter + slope_error, MARGIN * period_us)
         beats = int((above + margin) // period_us)
-        limit = max(HALF * period_us, TOLERANCE)
-        if -limit <= above and (not beats or above <= limit + 10.0 * floor.delay):
-            late = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if informative else 0.0
+        if beats > 0:
+            if above > max(USUAL * floor.delay, MIN_USUAL_US):
+                since_us = origin_us + 1e6 * x + value_us
+            usual = above <= USUAL * floor.delay and floor.delay > HALF * period_us
+            beats = self._lost(above, margin, informative)
+            if usual and informative and not beats:  # the jitter is longer than the period
+                late = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter)
+                beats = round(late / period_us)
+        elif above >= -self._limit_us:
+            if self._beliefs and above < -MARGIN * period_us:
+                since_us = origin_us + 1e6 * x + value_us - self._beliefs[-1].beats * period_us
+            if informative:
+                self._waited()
+                late = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter)
             beats = round(late / period_us)
         if beats:
             self._count += beats
@@ -480,4 +532,55 @@ class DeviceClock:
             if not 0 < beats <= KEEP_PHASE:
                 floor.restart(x, y)
         self._unseen += max(beats, 0)
-        return origin_us + 1e6 * x + floor.value_at(x), beats < 0, max(beats, 0)
+        return origin_us + 1e6 * x + floor.value_at(x), since_us, taken_back or beats < 0, max(beats, 0)
+
+    def _waited(self) -> None:
+        """Count the delays of late readings as usual, because the reading after them is in time."""
+        for above in self._late:
+            self._floor.note(above)
+        self._late, self._least = [], inf
+
+    def _lost(self, above: float, margin: float, informative: bool) -> int:
+        """Return the number of lost readings to believe in after a reading `above` (µs) the line.
+
+        Readings that waited arrive faster than the period, each less late than the one before. So a reading
+        counts only if it is not less late than all before it. If delays are longer than the period, the
+        readings after a late one must wait for it, and their number proves less.
+        """
+        period_us, floor = 1e6 * self._period, self._floor
+        if self._least == inf or len(self._late) == RUN:
+            self._late, self._least = [above], above
+        elif informative:
+            self._late = [*self._late, above] if above > self._least - MARGIN * period_us else []
+            self._least = min(self._least, above)
+        usual = max(floor.delay, MIN_USUAL_US / USUAL) * max(1.0, 2.0 * floor.delay / period_us)
+        if len(self._late) * self._least < CERTAIN_DELAYS * usual:
+            return 0
+        beats = int((self._least + margin) // period_us)
+        self._beliefs.append(Belief(beats, self._received_us, copy(floor), self._least, self._out_us))
+        self._late, self._least = [], inf
+        return beats
+
+    def _take_back(self, arrival_us: int, origin_us: int) -> bool:
+        """Take back the losses that a reading refutes; return True if there were any.
+
+        With the loss, the reading would have been sent after its arrival. Also the line is as before it.
+        """
+        count, period_us = self._count, 1e6 * self._period
+        while self._beliefs:
+            beats, believed_us, floor, least, out_us = self._beliefs[-1]
+            x = self._count * self._period
+            y = arrival_us - origin_us - 1e6 * x
+            error = MARGIN * period_us + min(8.0 * floor.scatter, HALF * period_us)
+            error += 3.0 * floor.slope_sigma * beats * self._period
+            if y >= floor.value_at(x) - error and y >= self._floor.value_at(x) - self._limit_us:
+                break
+            if self._received_us - believed_us > DOUBT * period_us:
+                self._beliefs.clear()
+                break
+            self._beliefs.pop()
+            self._floor, self._late, self._least, self._out_us = floor, [], least, out_us
+            self._count -= beats
+            self._unseen -= beats
+            self.invented += beats
+        return self._count < count

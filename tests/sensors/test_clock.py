@@ -189,6 +189,51 @@ def test_unseen_losses_are_counted(rate: float, jitter: float) -> None:
     assert np.median(np.abs(error)) < 3_000
 
 
+@pytest.mark.parametrize(
+    ("rate", "jitter"), [(1.0, 8e-3), (10.0, 1e-3), (20.0, 8e-3), (154.0, 1e-3), (1e3, 0.0)]
+)
+@pytest.mark.parametrize("delay", [0.38, 5.0])
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_readings_that_waited_are_not_lost(rate: float, jitter: float, delay: float, lost: float) -> None:
+    """They arrive one by one, 0.1 ms apart; some of them may be lost, which shows after the last one."""
+    true = np.arange(0.0, max(20.0, 400.0 / rate), 1.0 / rate)
+    start = 0.6 * true[-1]
+    waited = (true >= start) & (true < start + delay)
+    arrived = arrivals(true, jitter)
+    arrived[waited] = start + delay + 1e-4 * np.arange(waited.sum())
+    kept = ~waited | (np.random.default_rng(1).random(true.size) >= lost)
+    true, arrived = true[kept], np.maximum.accumulate(arrived)[kept]
+    clock = DeviceClock(period=1.0 / rate)
+    made = [clock.update(Reading((0.0, 0.0, 0.0)), EPOCH + round(1e6 * time)) for time in arrived.tolist()]
+    error = np.array([reading.time_us - EPOCH for reading in made]) - 1e6 * true
+    assert sum(reading.missing for reading in made) - clock.invented == np.count_nonzero(~kept)
+    assert clock.rate == pytest.approx(rate)
+    assert abs(clock.drift_ppm) < 200.0
+    burst = (true >= start) & (arrived - true > 1.0 / rate + 12.0 * jitter)
+    last = int(np.flatnonzero(burst)[-1]) if burst.any() else 0
+    assert np.abs(error[last + 10 :]).max() < 2e6 * max(jitter, 1e-4)
+    wrong = np.abs(error) > 0.5e6 / rate + 2e4
+    assert all(reading.since_us for reading, is_wrong in zip(made, wrong, strict=True) if is_wrong)
+    if not lost:  # the first ones still look as if others before them were lost
+        assert np.count_nonzero(wrong) <= 3 + 0.004 * waited.sum()
+
+
+@pytest.mark.parametrize(("rate", "jitter"), [(20.0, 8e-3), (50.0, 1e-3), (154.0, 1e-3), (1e3, 0.0)])
+def test_losses_do_not_look_like_jitter(rate: float, jitter: float) -> None:
+    """A tenth of the readings is lost; uncounted losses must not let later ones pass as long delays."""
+    numbers = np.flatnonzero(np.random.default_rng(1).random(round(60 * rate)) > 0.1)
+    true = (numbers - numbers[0]) / rate
+    clock = DeviceClock(period=1.0 / rate)
+    made = stamps(clock, np.full(true.size, nan), arrivals(true, jitter))
+    lost = numbers[-1] - numbers[0] + 1 - numbers.size
+    assert sum(stamp.missing for stamp in made) - clock.invented == pytest.approx(lost, rel=0.03)
+    error = error_us(made, true)[true.size // 4 :]
+    assert np.median(np.abs(error)) < 3e3
+    assert np.quantile(np.abs(error), 0.97) < 1.03e6 / rate + 10e3
+    assert np.abs(error).max() < 0.25e6
+    assert abs(clock.drift_ppm) < 100
+
+
 def test_an_irregular_instrument_is_dated_by_arrival() -> None:
     clock = DeviceClock()
     assert [update(clock, nan, EPOCH + t).time_us - EPOCH for t in (0, 70_003, 70_003, 90_000)] == [
