@@ -234,7 +234,7 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
     from magbridge.columns import CHANNELS, require
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
-    from magbridge.logs.deployment import join
+    from magbridge.logs.deployment import join, refuse_repeated
 
     model, truth, scalar = request.model, request.truth, request.scalar.scalar
     start = None
@@ -247,6 +247,8 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
     with waiting("reading"):
         logs = cli.by_base_station(read_each(request.files, options=request.reading.options), truth.base)
         deployment = join(logs)
+        if request.reading.options.strict:
+            refuse_repeated(deployment)
     require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *model.named))
     deployment = with_true_heading(deployment, truth.heading_reference)
     cli.note_losses(deployment.attrs)

@@ -26,10 +26,12 @@ from magbridge.guard import Guarded, GuardedJob, guarded
 from magbridge.logs.checks import checked
 from magbridge.logs.compasses import by_columns
 from magbridge.logs.deployment import (
+    FROM_BOOT,
     NOTES,
     join,
     noted,
     passed_over,
+    refuse_repeated,
     renamed,
     same_columns,
     shifted,
@@ -89,6 +91,8 @@ def read(
         The format needs a package that is not installed.
     """
     dataset = join(read_each(paths, options=options))
+    if options.strict:
+        refuse_repeated(dataset)
     require(dataset, required)
     return decoded(dataset) if decode_times else dataset
 
@@ -127,6 +131,8 @@ def read_chunks(
         stream = merge(sources, rows, named, options.clock_offset_s)
     for dataset, _ in pairwise(chain(stream, [None])):  # one ahead: the last piece reports all skipped files
         if dataset is not None:
+            if options.strict:
+                refuse_repeated(dataset)
             require(dataset, required)
             yield files.counted(dataset)
 
@@ -287,7 +293,7 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
     if not counts_from_boot(part):
         unused = f"{part.attrs['source']}: --date was not used, because the log's times have a date"
         return part.assign_attrs({NOTES: "\n".join([*noted(part.attrs), unused])})
-    return shifted(part, date).assign_attrs(time_reference="utc")
+    return shifted(part, date).assign_attrs({"time_reference": "utc", FROM_BOOT: 1})
 
 
 def _origin(source: str) -> str:

@@ -33,6 +33,7 @@ CHANGES_SETTING = "align.changes"
 """Attribute that counts the changes of settings during a log; the other settings are those of its start."""
 COUNTERS = {
     "bytes_skipped": ("byte skipped", "bytes skipped"),
+    "contradictory_rows": ("row contradicts another file", "rows contradict another file"),
     "damages": ("damaged place", "damaged places"),
     "dropouts": ("dropout", "dropouts"),
     "duplicate_rows": ("duplicate row", "duplicate rows"),
@@ -51,6 +52,11 @@ HISTORY_ATTRIBUTE = "history"
 """Attribute that keeps the assumptions in written files, a line for each."""
 LOSSES_ATTRIBUTE = "losses"
 """Attribute that names the losses, a line for each file and column; it is not written to files."""
+FROM_BOOT = "from_boot"
+"""Attribute of a deployment whose times counted from a boot before the user dated them; it is not written to
+files."""
+SAME_VALUE = 1e-6, 1e-3
+"""Relative and absolute difference up to which two values are the same, because some files round them."""
 NOTES = "notes"
 """Attribute with a line for each choice of the reader: one of several compasses, a name, a unit."""
 
@@ -170,7 +176,8 @@ def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, 
 def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return several deployments as one, sorted in time, with NaN where a part lacks a column.
 
-    If rows have the same time, the first part's row is kept. The others fill its NaNs and are counted.
+    If rows have the same time, the values of the first part are kept, and the others fill its NaNs. Rows that
+    repeat the first one's values are counted as duplicates; rows with other values are counted and named.
     FormatError: two parts disagree on a unit, or on the reference of headings or times.
     """
     if len(parts) == 1:
@@ -188,8 +195,38 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     whole = {name: np.concatenate([part.variables[name].values for part in alike]) for name in names}
     coords = {"time": ("time", whole.pop("time"), parts[0]["time"].attrs)}
     columns = {name: ("time", values, described[name]) for name, values in whole.items()}
-    joined = merged(xr.Dataset(columns, coords, join_attrs(parts)))
-    return with_losses(joined, {"duplicate_rows": len(coords["time"][1]) - joined.sizes["time"]})
+    stacked = xr.Dataset(columns, coords, join_attrs(parts))
+    return with_losses(merged(stacked), *_repeated(stacked, parts))
+
+
+def _repeated(stacked: xr.Dataset, parts: Sequence[xr.Dataset]) -> tuple[dict[str, int], list[str]]:
+    """Return the counts of the `parts` rows whose time occurs before, and a line for each two files."""
+    time = stacked["time"].values
+    order = np.argsort(time, kind="stable")
+    ordered = time[order]
+    again = np.flatnonzero(ordered[1:] == ordered[:-1]) + 1
+    first, other = order[np.searchsorted(ordered, ordered[again])], order[again]
+    repeats, differs = np.zeros(len(other), bool), np.zeros(len(other), bool)
+    for column in stacked.data_vars.values():
+        expected, found = column.values[first], column.values[other]
+        repeats |= np.isfinite(expected) & np.isfinite(found)
+        differs |= ~np.isclose(found, expected, *SAME_VALUE) & np.isfinite(found - expected)
+    part = np.repeat(np.arange(len(parts)), [part.sizes["time"] for part in parts])
+    pairs = np.stack([part[first[differs]], part[other[differs]]], axis=1)
+    lines = []
+    for (a, b), count in zip(*np.unique(pairs, axis=0, return_counts=True), strict=True):
+        kept, source = (parts[k].attrs.get("source", "") for k in (a, b))
+        lines.append(f"{source}: {count:,} of its rows have the times of {kept}, but other values: not used")
+    counts = {"duplicate_rows": int((repeats & ~differs).sum()), "contradictory_rows": int(differs.sum())}
+    return counts, lines
+
+
+def refuse_repeated(joined: xr.Dataset) -> None:
+    """Raise FormatError if files of a `joined` deployment have rows of equal times."""
+    repeated = [name for name in ("duplicate_rows", "contradictory_rows") if name in joined.attrs]
+    if repeated:
+        expected = f"expected logs without {' '.join(repeated)}, as --strict was given"
+        raise FormatError(joined.attrs["source"], "; ".join([expected, *named_losses(joined.attrs)]))
 
 
 def merged(dataset: xr.Dataset) -> xr.Dataset:
@@ -243,7 +280,7 @@ def plain_attrs(attrs: Mapping[Any, Any]) -> dict[str, str | int | float]:
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
     """Return the deployment without the attributes of reading: counts, losses, guesses and notes."""
     bare = dataset.copy(deep=False)
-    counted = {GUESSED_ATTRIBUTE, LOSSES_ATTRIBUTE, NOTES, *COUNTERS}
+    counted = {FROM_BOOT, GUESSED_ATTRIBUTE, LOSSES_ATTRIBUTE, NOTES, *COUNTERS}
     bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in counted}
     return bare
 

@@ -22,8 +22,10 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, COLUMNS, counts_from_boot
 from magbridge.errors import FormatError, WrongUse
+from magbridge.logs.clocks import BETWEEN_RUNS_S
 from magbridge.logs.compasses import COMPASSES_ATTRIBUTE, further
 from magbridge.logs.deployment import (
+    FROM_BOOT,
     NOTES,
     join,
     join_attrs,
@@ -71,7 +73,7 @@ def merge(
         room -= first.nbytes
         # if the memory for first pieces is full, the log is opened again later
         opened.append(partial(chain, [first], pieces) if room > 0 else partial(source, rows))
-    if _sensor_logs(firsts, declared)[0]:
+    if _sensor_logs(firsts, declared)[0] or sum(map(_is_from_boot, firsts)) > 1:
         logs = [join([*pieces()]) for pieces in opened]
         yield from sliced(join(combine(logs, declared, clock_offset_s)), rows)
         return
@@ -104,12 +106,20 @@ def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: f
     """Return the sensors' own logs with the vehicle's telemetry, and the logs that need no telemetry.
 
     `named`: True for each log that the user declares as a sensor's. `clock_offset_s`: added to the sensors'
-    times, s. FormatError: no time in common, or only the times of one kind of log count from 1970.
+    times, s. FormatError: no time in common, or only the times of one kind of log count from 1970; or several
+    sensors' logs count from different boots.
     """
     sensors, vehicles = _sensor_logs(logs, named)
     if not sensors:
         refuse_offset(clock_offset_s)
-        return list(logs)
+        return _in_runs(logs)
+    own = [logs[k] for k in sensors]
+    for log, run in zip(own, _in_runs(own), strict=True):
+        if run is not log:
+            ways = "each with the vehicle's logs and its own --clock-offset"
+            raise FormatError(
+                log.attrs["source"], f"counts from another boot than the log before: read {ways}"
+            )
     vehicle = join([logs[k] for k in vehicles])
     combined = []
     covered = [np.empty(0)]
@@ -125,6 +135,36 @@ def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: f
     note = _note(source, vehicle, np.concatenate(covered), clock_offset_s)
     first = combined[0].assign_attrs({NOTES: "\n".join([*noted(combined[0].attrs), note])})
     return [first, *combined[1:]]
+
+
+def _is_from_boot(log: xr.Dataset) -> bool:
+    return FROM_BOOT in log.attrs or counts_from_boot(log)
+
+
+def _in_runs(logs: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    """Return the logs; one that counts from another boot than those before becomes a run after them."""
+    placed: list[xr.Dataset] = []
+    for log in logs:
+        before = [one for one in placed if _is_from_boot(one)] if _is_from_boot(log) else []
+        if any(_contradict(one, log) for one in before):
+            end = max(float(one["time"].values[-1]) for one in before)
+            note = f"{log.attrs['source']}: counts from another boot than the logs before: a run after them"
+            log = shifted(log, end + BETWEEN_RUNS_S - float(log["time"].values[0]))  # noqa: PLW2901
+            log.attrs[NOTES] = "\n".join([*noted(log.attrs), note])
+        placed.append(log)
+    return placed
+
+
+def _contradict(log: xr.Dataset, like: xr.Dataset) -> bool:
+    """Return True if logs overlap in time and most of their columns are the same, but not their values."""
+    names = [name for name in log.data_vars if name in like]
+    if not log.sizes["time"] or not like.sizes["time"]:
+        return False
+    (begin, end), (start, stop) = log["time"].values[[0, -1]], like["time"].values[[0, -1]]
+    if 2 * len(names) <= min(len(log.data_vars), len(like.data_vars)) or start > end or begin > stop:
+        return False
+    counts = join([uncounted(log[names]), uncounted(like[names])]).attrs
+    return bool(counts.get("contradictory_rows", 0) >= counts.get("duplicate_rows", 0))
 
 
 def refuse_offset(clock_offset_s: float) -> None:

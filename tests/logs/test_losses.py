@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from commands import Command
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from magbridge import logs
 from magbridge.errors import FormatError
 from magbridge.logs.checks import checked, in_order
-from magbridge.logs.deployment import deployment, named_losses, passed_over
+from magbridge.logs.deployment import LOSSES_ATTRIBUTE, deployment, named_losses, noted, passed_over
 
 T0 = 1.7e9
 
@@ -56,6 +57,65 @@ def test_rows_at_one_time_become_one() -> None:
     assert read["x"].values.tolist() == [0, 7, 2, 3, 4, 5]
     assert read["y"].values.tolist() == [0, 1, 2, 3, 4, 5]
     assert passed_over(read.attrs) == {"duplicate_rows": 2}
+
+
+def text(path: Path, start: float, x: np.ndarray) -> Path:
+    """Write a log with a row per second and two columns."""
+    rows = [f"{start + k},{value},{-value}" for k, value in enumerate(x)]
+    path.write_text("\n".join(["time,mag_x [nT],mag_y [nT]", *rows]))
+    return path
+
+
+def both_ways(paths: list[Path], date: float | None = None, *, strict: bool = False) -> list[xr.Dataset]:
+    """Return the logs as a whole, and joined from pieces."""
+    options = logs.Options(strict=strict, date=date)
+    pieces = list(logs.read_chunks(paths, 30, options=options))
+    streamed = xr.concat(pieces, "time", combine_attrs="drop")
+    counts = passed_over(*(piece.attrs for piece in pieces))
+    streamed.attrs = {**counts, LOSSES_ATTRIBUTE: "\n".join(named_losses(*(p.attrs for p in pieces)))}
+    return [logs.read(paths, options=options), streamed]
+
+
+@pytest.mark.parametrize("date", [None, T0])
+def test_files_that_count_from_two_boots_are_two_runs(tmp_path: Path, date: float | None) -> None:
+    """As a restart inside one file; a file that goes on with the same rows is no other boot."""
+    x = np.linspace(2e4, 3e4, 100)
+    paths = [text(tmp_path / "a.csv", 5.0, x), text(tmp_path / "b.csv", 0.25, x[::-1])]
+    for one in both_ways(paths, date):
+        time = one["time"].values - (date or 0.0)
+        np.testing.assert_allclose(time, np.r_[5.0 + np.arange(100), 164.0 + np.arange(100)], atol=1e-5)
+        assert one["mag_x"].values.tolist() == [*x, *x[::-1]]
+        assert passed_over(one.attrs) == {}
+    assert noted(logs.read(paths).attrs)[0].startswith("b.csv: counts from another boot")
+    goes_on = text(tmp_path / "c.csv", 65.0, np.r_[x[60:], x])
+    for one in both_ways([paths[0], goes_on]):
+        assert one.sizes["time"] == 200
+        assert passed_over(one.attrs) == {"duplicate_rows": 40}
+
+
+def test_rows_of_equal_times_but_other_values_are_no_duplicates(tmp_path: Path) -> None:
+    x = np.linspace(2e4, 3e4, 100)
+    paths = [text(tmp_path / "a.csv", T0, x), text(tmp_path / "b.csv", T0 + 80.0, np.r_[x[80:90], x[:40]])]
+    for one in both_ways(paths):
+        assert one.sizes["time"] == 130
+        assert one["mag_x"].values[:100].tolist() == x.tolist()
+        assert passed_over(one.attrs) == {"contradictory_rows": 10, "duplicate_rows": 10}
+        assert any("b.csv: " in line and " of a.csv" in line for line in named_losses(one.attrs))
+    with pytest.raises(FormatError, match=r"contradictory_rows, as --strict .* b\.csv: 10 .* a\.csv"):
+        logs.read(paths, options=logs.Options(strict=True))
+
+
+def test_strict_refuses_rows_that_two_files_repeat(tmp_path: Path) -> None:
+    """But not rows that complete each other."""
+    x, strict = np.linspace(2e4, 3e4, 100), logs.Options(strict=True)
+    paths = [text(tmp_path / "a.csv", T0, x), text(tmp_path / "b.csv", T0 + 80.0, x[80:])]
+    for read in (logs.read, lambda *args, **kwargs: list(logs.read_chunks(*args, **kwargs))):
+        with pytest.raises(FormatError, match=r"a\.csv, b\.csv: expected logs without"):
+            read(paths, options=strict)
+    lines = [f"{T0 + k},{k}" for k in range(100)]
+    (tmp_path / "d.csv").write_text("\n".join(["time,depth [m]", *lines]))
+    for one in both_ways([paths[0], tmp_path / "d.csv"], strict=True):
+        assert one.sizes["time"] == 100
 
 
 @given(time=st.lists(st.integers(0, 9), max_size=12))

@@ -95,6 +95,11 @@ def test_a_sensor_that_counts_from_its_boot_needs_the_offset(both: tuple[Path, P
     with pytest.raises(FormatError, match="count from a start"):
         logs.read([boot, both[1]])
     log = logs.read([boot, both[1]], options=Options(clock_offset_s=START))
+    other = tmp_path / "other.csv"  # of another boot, so that one offset cannot be right for both
+    other.write_text(boot.read_text().replace(",1000,", ",-1000,"))
+    for read in (logs.read, lambda *args, **kwargs: list(logs.read_chunks(*args, **kwargs))):
+        with pytest.raises(FormatError, match=r"other\.csv: counts from another boot .* own --clock-offset"):
+            read([boot, other, both[1]], options=Options(clock_offset_s=START))
     assert log["time"][0] == START + 0.5
     assert log.attrs.get("time_reference", "utc") == "utc"
 
