@@ -11,7 +11,7 @@ from msgspec.structs import replace as replace_struct
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.methods import ellipsoid
-from magbridge.calibration.fitting.observations import Observations, polynomial_samples
+from magbridge.calibration.fitting.observations import Observations, beside_motion, polynomial_samples
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
@@ -348,3 +348,14 @@ def test_rows_beside_a_motion_do_not_bias_the_fit_of_a_survey() -> None:
     # the sensor's own noise, 1 nT on each of three axes, is the floor
     assert np.sqrt(np.mean(error**2)) < 1.4
     assert np.std(error / corrected.sigma[data.at_rest]) == pytest.approx(0.9, abs=0.2)
+
+
+@pytest.mark.parametrize("hertz", [0.25, 1.0, 10.0, 50.0])
+def test_a_slow_motion_is_a_motion_at_any_sampling_rate(hertz: float) -> None:
+    time = np.arange(0.0, 200.0, 1.0 / hertz)
+    positions = np.clip(0.01 * (time - 100.0), 0.0, 0.5)[:, None]  # 1 % of the range in a second
+    moving = beside_motion(time, positions, np.ones(1))
+    assert moving[(time > 100.0) & (time < 150.0)].all()
+    longest = max(1.0, 1.0 / hertz)
+    assert not moving[(time < 100.0 - longest) | (time > 150.0 + longest)].any()
+    assert not beside_motion(time, np.empty((len(time), 0)), np.empty(0)).any()

@@ -225,18 +225,23 @@ class Observations:
 
 
 def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
-    """Return a mask (n,) that is True for samples before or after a motion of a mass.
+    """Return a mask (n,) that is True for samples before, during or after a motion of a mass.
 
-    A mass moves if its position changes faster than the default ``moving_rate`` of the alignment. `time`
-    (n,): s. `values` (n, k): positions of the masses. `spans` (k,): their ranges, in the same units.
+    A mass moves if its position changes faster than the default ``moving_rate`` of the alignment, from one
+    sample to the next or over 1 s, whichever is longer. `time` (n,): s. `values` (n, k): positions of the
+    masses. `spans` (k,): their ranges, in the same units.
     """
-    # a step of a position that is larger than the slowest motion means that the mass moves
-    fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
-    step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
-    moving = np.zeros(len(time), bool)
-    moving[1:] |= step
-    moving[:-1] |= step
-    return moving
+    # a clock that was set back continues
+    t = np.cumsum(np.maximum(np.diff(time, prepend=time[:1]), 0.0))
+    then = np.minimum(t[:-1], t[1:] - 1.0)
+    past = np.array([np.interp(then, t, one) for one in values.T]).T.reshape(values[1:].shape)
+    fastest = Align().moving_rate * spans * (t[1:] - then)[:, None]
+    last = np.flatnonzero((np.abs(values[1:] - past) > fastest).any(axis=1)) + 1
+    # samples from `then` to the last one of each motion
+    bounds = np.zeros(len(time) + 1)
+    np.add.at(bounds, np.searchsorted(t, then[last - 1]), 1.0)
+    np.add.at(bounds, last + 1, -1.0)
+    return np.asarray(np.cumsum(bounds)[:-1] > 0.0)
 
 
 def _enough(
