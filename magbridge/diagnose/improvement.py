@@ -223,7 +223,11 @@ def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
     e, g = residuals(probes, coefficients)
     shift = np.abs(residuals(probes, moved_coefficients)[0] - e)
     J = derivatives(calibration, probes, g, np.eye(K))
-    before = np.einsum("ij,jk,ik->i", J, calibration.covariance + floor(calibration), J)
+    # with training logs the fit begins before them: the calibration's covariance contains them already
+    D, prior = problem.directions[:K, problem.known], calibration.covariance
+    if problem.survey.learned.any():
+        prior = D @ D.T + problem.unseen
+    before = np.einsum("ij,jk,ik->i", J, prior + floor(calibration), J)
     after = np.einsum("ij,jk,ik->i", J, own.covariance, J)
     limit = MAX_DEPARTURE_SIGMA * np.sqrt(before + problem.calibration.noise.sensor**2)
     # Moves that the log determines are not limited; of the others 1 % may exceed the limit

@@ -146,9 +146,11 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
         ds[name].to_numpy() if name in ds else np.full(len(known), np.nan) for name in calibration.channels
     ]
     read = np.stack(channels, axis=1)[known] if channels else np.empty((len(field), 0))
+    noise = calibration.noise
     return replace(
         samples.part(known),
-        rho=None if calibration.warnings else calibration.noise.autocorrelation,  # else it is the crust
+        # autocorrelation of successive samples; with warnings it is the crust's
+        rho=None if calibration.warnings else (1.0 - noise.white) * noise.autocorrelation,
         modes=_modes(apart_from_level(calibration), field, read, samples.time[known]),
         level_sigma=hypot(samples.level_sigma, calibration.reference.level_sigma),
     )

@@ -271,6 +271,17 @@ def test_what_a_calibration_learned_from_a_log_does_not_count_twice() -> None:
     assert "filter_lag" in named(ds) - named()
 
 
+def test_moves_that_the_training_logs_determine_are_not_refused() -> None:
+    """The tutorial in docs/when-the-model-is-wrong.md: the water is 8 degC warmer than in the runs."""
+    flight = simulate(load("warming"), 2).isel(time=slice(None, None, 2))
+    runs, survey = (flight.sel(time=chosen) for chosen in (flight["run"] <= 10, flight["run"] > 10))
+    calibration = fit(observations(runs, ("battpos", "ballast")), "auto").calibration
+    found = diagnose([survey], calibration, training_logs=[runs]).diagnosis
+    assert found.refused == ""
+    assert found.improvement.before > 10.0
+    assert found.improvement.after < 1.5
+
+
 def test_a_report_names_and_counts_the_dives_of_what_is_diagnosed_alone() -> None:
     """The survey's dives have equal numbers and source, with and without the log of the calibration."""
     parts = segments(simulate(load("survey"), 2))

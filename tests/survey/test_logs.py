@@ -78,13 +78,14 @@ def flown(
     )  # fmt: skip
 
 
-def calibrated(vehicle: str, path: Path) -> Path:
-    """Write the vehicle's calibration: its hard iron, exactly, on a wrong level."""
+def calibrated(vehicle: str, path: Path, **slow: float) -> Path:
+    """Write the vehicle's calibration: its hard iron, exactly, on a wrong level; `slow`: part of its noise."""
     iron, level = IRON[vehicle]
     coefficients = np.array([level, level, level, 0.0, 0.0, 0.0, *iron])
     known = replace(
-        identity(), coefficients=coefficients, covariance=1e-6 * np.eye(9), noise=Noise(NOISE), method="auto"
-    )
+        identity(), coefficients=coefficients, covariance=1e-6 * np.eye(9), noise=Noise(NOISE, **slow),
+        method="auto",
+    )  # fmt: skip
     save(known, path)
     return path
 
@@ -112,6 +113,16 @@ def test_two_vehicles_with_a_calibration_each_make_one_map(command: Command, tmp
     assert facts["lines"] == 2
     assert facts["misties_before_nT"] == pytest.approx(64.0, abs=2.0)
     assert facts["misties_after_nT"] < 2.0 * NOISE
+    assert np.std(error) < 3.0 * NOISE
+    assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+
+
+def test_a_small_slow_part_of_the_noise_is_not_all_of_it(command: Command, tmp_path: Path) -> None:
+    write(flown("comet", lanes(0)), tmp_path / "log.nc")
+    slow = {"autocorrelation": 0.998, "interval": STEP, "white": 0.99}
+    words = tmp_path / "log.nc", "--calibration", calibrated("comet", tmp_path / "cal.json", **slow)
+    error, sigma, facts = judged(command, tmp_path, *words)
+    assert facts["noise_nT"] == pytest.approx(NOISE, rel=0.2)
     assert np.std(error) < 3.0 * NOISE
     assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
 
