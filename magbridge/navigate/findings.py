@@ -135,7 +135,7 @@ def findings_of(
     findings += _jumps(jumps, float(result["time"][0]))
     if (lost := (state == NavigationState.LOST)).any():
         findings.append(
-            f"lost for {100.0 * lost.mean():.0f} % of the track, first after {hours[lost][0]:.1f} h"
+            f"lost for {100.0 * lost.mean():.2g} % of the track, first after {hours[lost][0]:.1f} h"
         )
     findings += _level(result, options)
     if reference_track is not None:
