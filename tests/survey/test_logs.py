@@ -79,7 +79,7 @@ def flown(
 
 
 def calibrated(vehicle: str, path: Path, **slow: float) -> Path:
-    """Write the vehicle's calibration: its hard iron, exactly, on a wrong level; `slow`: part of its noise."""
+    """Write the vehicle's calibration: its hard iron, exactly, on a wrong level, with slow noise."""
     iron, level = IRON[vehicle]
     coefficients = np.array([level, level, level, 0.0, 0.0, 0.0, *iron])
     known = replace(
