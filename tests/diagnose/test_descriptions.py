@@ -203,7 +203,7 @@ def test_two_packets_are_found_where_they_are_in_noise_of_any_correlation(
     t = np.arange(n)
     planted = np.zeros(n)
     for moment, period, length in ((0.3 * n, 40.0, 90.0), (0.7 * n, 25.0, 30.0)):
-        planted += 2.5 * np.exp(-0.5 * ((t - moment) / length) ** 2) * np.cos(2 * np.pi * t / period + 1.0)
+        planted += 4.0 * np.exp(-0.5 * ((t - moment) / length) ** 2) * np.cos(2 * np.pi * t / period + 1.0)
     noise = drawn(problem, rho, rng)
     given = replace(problem, residual=problem.reference_jacobian * planted + noise)
     found, best = fitted(given)

@@ -84,7 +84,10 @@ def test_every_instrument_s_protocol_arrives_whole(
     assert result["samples"] == result["rows"] == 150
     part = result["parts"][0]
     assert part["corrected_rms_nT"] == pytest.approx(part["raw_rms_nT"], abs=30 * step + 15)
-    assert set(result["flags"]) <= {"uncalibrated", "no_boresight", "gap"}
+    flags = result["flags"]
+    # without a clock, a reading after a gap may have waited instead
+    assert flags.pop("late_join", 0) <= (flags["gap"] if driver == "hmr2300" else 0)
+    assert set(flags) <= {"uncalibrated", "no_boresight", "gap"}
     assert any("sends readings" in text for text in result["said"])
 
 
