@@ -7,7 +7,7 @@ aligner subtracts this delay from the sample's time, and evaluates the telemetry
 If the process stalls, readings and telemetry wait in buffers. An input with a time stamp (of the instrument,
 or of the autopilot by TIMESYNC) keeps its time. Any other input may have been measured at any time during the
 stall. A sample with an input of unknown time is flagged ``late_join``, and its sigma covers all values that
-the parameters had during the stall. The same applies to a reading that may have waited before it arrived.
+the parameters had during the stall. The flag also marks a reading that may have waited.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Track:
 
     The parameter is moving if the last value differs from that of 1 s before by more than ``moving_rate``, a
     fraction of the calibrated range per second. The noise of the telemetry would look like motion over
-    shorter times. Values farther apart than 1 s are interpolated.
+    shorter times. Values at longer intervals are interpolated.
 
     From one value to the next, a moving parameter lies between the two. If the next value is late, its bounds
     grow by `rate`, the rate of the last value, up to the calibrated range.
@@ -137,8 +137,8 @@ class Track:
     def value_at(self, time_us: int) -> tuple[float, float, float, float]:
         """Return the value at `time_us` (µs), its age (s), and two values that bound it during a motion.
 
-        Between two values the result is interpolated, and the age is 0. If they are farther apart than
-        ``max_age``, the age is the time to the nearer one. After the last value, the last value is used.
+        Between two values the result is interpolated, and the age is 0. If the interval exceeds ``max_age``,
+        the age is the time to the nearer value. After the last value, the last value is used.
         Before the first value, the first value is used, and the age is the time until it was measured.
         """
         after_us, after = self.last_us, self.last
@@ -309,7 +309,7 @@ class Aligner:
                 if track.input.is_mass:
                     quality |= MOVING  # or stopped less than settle_time ago
                     self.motion_since_us = min(self.motion_since_us, track.reported_before_us)
-            elif age and sample_us < track.last_us:  # between two values that are far apart
+            elif age and sample_us < track.last_us:  # between two values with a long interval
                 spans.append((index, low, high))
             if sample_us < track.first_us or (late_us and sample_us > track.last_us):
                 quality |= LATE_JOIN

@@ -43,8 +43,8 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     sample before the telemetry reports a motion, if the telemetry of that sample is older than the sample. A
     motion that begins with the first row of a piece does not flag the last row of the previous piece.
 
-    Between two reports that are farther apart than ``max_age``, a parameter is interpolated, and sigma covers
-    both values. Its age is then the time to the nearer report.
+    If the interval of two reports exceeds ``max_age``, a parameter is interpolated between them, and sigma
+    covers both values. Its age is then the time to the nearer report.
 
     Parameters
     ----------

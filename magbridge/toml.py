@@ -87,7 +87,7 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
 
 
 def _valid(kind: Any, keys: str) -> list[str]:
-    """Return what is valid at the dotted path `keys` in `kind`: the keys of a table, or the listed values."""
+    """Return the valid keys of a table, or the listed values, at the dotted path `keys` in `kind`."""
     tables = [inspect.type_info(kind)]
     for key in [*filter(None, re.split(r"\.|(?=\[)", keys)), None]:
         tables = [

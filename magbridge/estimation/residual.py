@@ -53,7 +53,7 @@ class ResidualSamples:
     kappa: float = 0.0
     """Noise of the reference divided by the sensor's."""
     moving: BoolArray | None = None
-    """(n,): True for samples beside a motion of a mass, which have a larger error; None if there are none."""
+    """(n,): True for samples next to a motion of a mass, which have a larger error; None if all rest."""
 
     def part(self, rows: slice | BoolArray | IndexArray) -> ResidualSamples:
         """Return the samples `rows`, given as a mask (n,), indices or a slice."""

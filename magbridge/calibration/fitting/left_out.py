@@ -127,7 +127,7 @@ def _predicted(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the errors (m,), nT, of all splits by linearised predictions, and their variances (m,), nT².
 
-    Both are in the units of a sample at rest: samples beside a motion have a larger variance.
+    Both are in the units of a sample at rest: samples next to a motion have a larger variance.
     """
     samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
     c, weight = found.coefficients, found.weighted.weight
