@@ -175,9 +175,8 @@ class Corrector:
         for index, low, high in spans:
             if index < k:
                 before, after = values[:index], values[index + 1 : k]
-                start, end = (
-                    _total(field, self._linear_at((*before, value, *after))) for value in (low, high)
-                )
+                start = _total(field, self._linear_at((*before, low, *after)))
+                end = _total(field, self._linear_at((*before, high, *after)))
                 found.append(end - start)
         return found
 
