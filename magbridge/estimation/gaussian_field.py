@@ -139,10 +139,15 @@ class GaussianField:
             power = self._lift @ power @ self._lift
         return csr_array(float(self._spectrum[1].mean()) * power)
 
-    @property
-    def edges(self) -> IndexArray:
-        """Limits (b + 1,) of blocks of nodes that couple only to the next block."""
-        return self.nodes.edges(max(self.alpha + 2, FALLING) if self.harmonic else max(self.alpha, SPLINE))
+    def edges(self, precision: csr_array) -> IndexArray:
+        """Return the limits (b + 1,) of blocks of nodes that a `precision` couples only to the next block.
+
+        `precision` (nodes, nodes): prior's, or posterior's, which also couples the nodes of two samples whose
+        noise is correlated.
+        """
+        strip, coupled = np.nonzero(self.nodes.number >= 0)[0], precision.tocoo()
+        reach = np.abs(strip[coupled.row] - strip[coupled.col]).max()
+        return self.nodes.edges(max(int(reach), FALLING if self.harmonic else SPLINE))
 
     @cached_property
     def log_determinant(self) -> float:

@@ -303,7 +303,7 @@ def _posterior(
     levels = problem.D @ z
     return Posterior(
         weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, follow,
-        reduced.precision, inverse_blocks(reduced.precision, choice.field.edges),
+        reduced.precision, inverse_blocks(reduced.precision, choice.field.edges(reduced.precision)),
         levels - levels[problem.kept].mean(), float(mean @ w),
     )  # fmt: skip
 

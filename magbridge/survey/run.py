@@ -99,8 +99,8 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
         except np.linalg.LinAlgError as problem:
             left_out = "".join(f"; {reason.text}" for reason in samples.left_out)
             raise CalibrationError(
-                f"the survey determines no map ({problem}): fly lines that cross, or give a calibration "
-                f"(--calibration){left_out}"
+                f"the map's equations are singular to rounding ({problem}): survey fewer lines at once, or "
+                f"thin the log{left_out}"
             ) from problem
     ties = crossovers(samples.place, samples.line)
     B = found.at_samples(samples)

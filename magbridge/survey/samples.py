@@ -146,6 +146,10 @@ def _bends(samples: Samples, lag: float) -> FloatArray:
     return out
 
 
+MAX_GAP_STEPS = 3.0
+"""Longest step between samples whose noise is correlated, in median steps of time (of place without time)."""
+
+
 class Rows:
     """Samples of a survey as rows of a linear model: field, blocks of parameters `groups`, and noise.
 
@@ -160,6 +164,11 @@ class Rows:
         self.D = BlockColumns(groups)
         self.scale = roughness.evaluate(samples.place)
         self.kept = np.ones(len(samples.value), bool)
+        # Noise is correlated between neighbours on one line only, and not across a gap.
+        timed = np.isfinite(samples.time).all()
+        step = np.diff(samples.time) if timed else np.linalg.norm(np.diff(samples.place, axis=0), axis=1)
+        usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.inf
+        self.next = (np.diff(samples.line) == 0) & (step <= MAX_GAP_STEPS * usual)
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
         """Return the matrix (m, nodes) from the field's coefficients to the anomaly at the samples `rows`."""
@@ -188,9 +197,8 @@ class Rows:
     def _pieces(self, field: GaussianField, rows: IndexArray, modes: bool) -> Iterator[LinearisedRows]:
         s = self.samples
         rows = rows[self.kept[rows]]
-        # Noise is correlated between neighbours on one line only.
         follows = np.zeros(len(rows), bool)
-        follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
+        follows[1:] = (np.diff(rows) == 1) & self.next[rows[:-1]]
         for start in range(0, len(rows), BLOCK_ROWS):
             # One row of overlap: a row's noise is correlated with the noise of the row before.
             first = max(start - 1, 0)

@@ -32,7 +32,7 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: 
     field = GaussianField(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic, buried)
     Q = field.precision.toarray()
     B = field.basis(place[::9])
-    variance = inverse_blocks(field.precision, field.edges).variances(B)
+    variance = inverse_blocks(field.precision, field.edges(field.precision)).variances(B)
     np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
     np.testing.assert_allclose(variance, 1.0, atol=0.2 if buried else 0.05)
     assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])
@@ -42,6 +42,18 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: 
     assert factor.log_determinant == pytest.approx(field.log_determinant)
     root = factor.draw(np.eye(field.nodes.size))
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(Q), atol=1e-6 * np.abs(np.linalg.inv(Q)).max())
+
+
+def test_blocks_span_the_nodes_of_two_samples_whose_noise_is_correlated() -> None:
+    """Steps of ten nodes' spacing couple more nodes than the splines do."""
+    place = np.random.default_rng(2).uniform(0.0, 300.0, (12, 2))
+    place[:, 0] = np.linspace(0.0, 5500.0, 12)
+    field = GaussianField(nodes_near(place, 50.0, 150.0), 150.0, 2)
+    B = field.basis(place)
+    sums = sum_rows([LinearisedRows(np.ones((12, 1)), B, np.arange(12) > 0)])
+    N = eliminate_field(sums, field, 50.0, 0.9).precision
+    variance = inverse_blocks(N, field.edges(N)).variances(B)
+    np.testing.assert_allclose(variance, np.einsum("ni,ni->n", B.toarray(), B @ np.linalg.inv(N.toarray())))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.4, 0.99])

@@ -12,13 +12,15 @@ from msgspec import structs
 from voyages import GLIDER, PLACE, Map, sail, synthetic, track_over
 
 from magbridge.arrays import FloatArray
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.nodes import nodes_near
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.read import read_grid
 from magbridge.survey import gridding
 from magbridge.survey.maps import anomaly_map
 from magbridge.survey.read import read_table
 from magbridge.survey.run import Result, survey
-from magbridge.survey.samples import Samples, crossovers
+from magbridge.survey.samples import Roughness, Rows, Samples, crossovers
 
 ORIGIN = 49.5, -57.9
 NOISE = 1.5
@@ -235,6 +237,16 @@ def test_crustal_field_is_searched_over_more_than_the_middle_of_a_dense_log(
     found = gridding.gridded(samples)
     assert 600.0 < found.field.length < 1500.0
     assert found.size == pytest.approx(50.0, rel=0.4)
+
+
+def test_noise_is_not_correlated_across_a_gap() -> None:
+    """Neither in time, nor in place if the time is not known."""
+    samples, _, _ = zigzag(np.random.default_rng(4), back=False)
+    samples = samples.part(np.delete(np.arange(600), np.s_[200:300]))
+    field = GaussianField(nodes_near(samples.place, 400.0, 400.0), 900.0, 4)
+    for one in (samples, replace(samples, time=np.full(500, np.nan))):
+        rows = Rows(one, gridding.level_blocks(one), Roughness.uniform())
+        assert rows.sums(field, np.arange(500)).pairs == 498
 
 
 def test_crossing_is_where_the_lines_cross() -> None:
