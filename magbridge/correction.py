@@ -203,7 +203,7 @@ class Correction:
         is_moving = bool(sample.quality & MOVING)
         if is_moving and not self._was_moving:
             health.begin_motion(self.aligner.motion_since_us)
-        self._was_moving = is_moving
+        self._was_moving, health.is_changing = is_moving, bool(sample.spans)
         reference = main_field, self.aligner.settings.reference_sigma
         variance = health.check(
             sample.time_us,

@@ -186,6 +186,7 @@ class ScalarCorrection:
     ) -> tuple[float, int]:
         """Return the variance (nT²) and the flags of the plausibility checks."""
         sample, F = pending.sample, pending.sample.field[0]
+        health.is_changing = bool(sample.spans)
         if pending.where is not None:
             health.set_position(sample.time_us, *pending.where)
         reference = pending.main_field, self.aligner.settings.reference_sigma

@@ -323,3 +323,33 @@ def test_a_calibration_that_names_the_filter_corrects_without_lag(delay_s: float
     late = np.radians(1.6) * delay_s
     turn = np.array([[np.cos(late), np.sin(late), 0.0], [-np.sin(late), np.cos(late), 0.0], [0.0, 0.0, 1.0]])
     assert heading_error(np.array(field)[6:], true[6:] @ turn.T) < 0.05
+
+
+@pytest.mark.parametrize("unit", ["A", "in"])
+def test_a_jump_that_the_next_telemetry_explains_is_withdrawn(unit: str) -> None:
+    """A parameter steps at 12 s and 24 s; telemetry (4 Hz) has the time of its arrival, 0.1 s late."""
+    rng, correction, sigma = np.random.default_rng(4), Correction(follows("amps", unit)), []
+    for k in range(20 * 40):
+        time_us, at = START + 50_000 * k, 0.04 * (k // 240 % 2)
+        if k % 5 == 1:
+            correction.telemetry("amps", 0.04 * (max(k - 2, 0) // 240 % 2), time_us)
+        x, y, z_raw = (rng.normal(0.0, 1.0, 3) + FIELD).tolist()
+        _, one = correction.reading(Reading((x + LINE * at, y, z_raw)), time_us)
+        wrong = abs(one.total_field - hypot(*FIELD)) > 10.0
+        assert one.quality & Quality.IMPLAUSIBLE or not wrong
+        sigma.append(one.total_field_sigma)
+    assert correction.notices == []
+    assert max(sigma[100:240] + sigma[270:480] + sigma[510:720] + sigma[750:]) < 1.5
+
+
+def test_a_jump_beside_an_unsteady_current_is_reported_after_its_next_telemetry() -> None:
+    rng, correction, flags = np.random.default_rng(4), Correction(follows("amps", "A")), []
+    for k in range(20 * 20):
+        time_us, amps = START + 50_000 * k, 0.02 * (k // 5 % 2)
+        correction.telemetry("amps", amps, time_us)
+        x, y, z = (rng.normal(0.0, 1.0, 3) + FIELD).tolist()
+        _, one = correction.reading(Reading((x + LINE * amps + 150.0 * (k >= 240), y, z)), time_us)
+        flags.append(bool(one.quality & Quality.IMPLAUSIBLE))
+        assert bool(correction.notices) == (k >= 250)
+    assert "which no telemetry explains" in correction.notices[0]
+    assert flags == [k >= 240 for k in range(400)]

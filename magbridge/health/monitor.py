@@ -18,7 +18,7 @@ from magbridge.records import Quality, Vector
 SUPPOSED_SPEED: Final = 30.0
 """Vehicle speed assumed until two positions give a speed, m/s."""
 MAX_AGE_S: Final = 60.0
-"""Longest time for which a sample waits for newer telemetry before the consistency test, s."""
+"""Longest time for which a jump or a sample of the consistency test waits for newer telemetry, s."""
 
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 UNSTEADY: Final = int(Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
@@ -45,6 +45,8 @@ class HealthMonitor:
         :class:`~magbridge.records.Quality` bits of the last sample.
     is_fault : bool
         True if the last sample is an outlier, comes from a faulty sensor, or is not the Earth's field.
+    is_changing : bool
+        True if telemetry of the next sample has changed, which may explain a jump; the caller sets it.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class HealthMonitor:
     ) -> None:
         self._common = level * level
         self.flags = 0
-        self.is_fault = False
+        self.is_fault = self.is_changing = False
         messages = messages or Messages()
         self.messages = messages.lines
         self._axes, self._level = RepetitionCheck(messages), LevelCheck(messages)
@@ -130,8 +132,12 @@ class HealthMonitor:
             dx, dy, dz = unit[0] - self._unit[0], unit[1] - self._unit[1], unit[2] - self._unit[2]
             turned = sqrt(dx * dx + dy * dy + dz * dz)
             self._unit = unit
+            if self.is_changing:
+                trend.follow_telemetry(time_us, total)
             variance += trend.check(time_us, total, own_sigma, turned, learn=not doubtful)
         self.is_fault = doubtful or trend.is_outlier or time_us < level.until_us
+        reported_us = time_us - round(1e6 * min(age, MAX_AGE_S))
+        trend.confirm(time_us if quality & Quality.STALE_TELEMETRY else reported_us)
         variance += trend.jump_variance(time_us)
         if self.is_fault or trend.is_away:
             self.flags = IMPLAUSIBLE
@@ -146,7 +152,7 @@ class HealthMonitor:
             new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, speed, course, sensitivity())
             consistency.add(new)
         if consistency.is_waiting:
-            consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
+            consistency.confirm(reported_us)
         return variance + self._scatter.excess() + consistency.variance()
 
     def explain(self, difference: float, *, jumps: bool) -> None:

@@ -17,8 +17,9 @@ outliers that agree with each other are a jump. Samples after a jump are flagged
 the sum of the jumps is zero, or the level is again that before the jumps. Sigma includes the largest jump,
 also for a while after the return.
 
-Telemetry reports a motion after the motion has begun. The filter then returns to its state before the motion,
-so that it does not count the effect of the motion as a jump.
+Telemetry reports a motion, or another change of a parameter, after the change has begun. The filter then
+returns to its state before the change, so that it does not count the effect of the change as a jump. The
+message about a jump waits until the telemetry is newer than the jump.
 """
 
 from __future__ import annotations
@@ -69,6 +70,8 @@ TREND_HOLD_US: Final = 60_000_000
 MAX_HOLD_US: Final = 3_600_000_000
 MAX_MOTION_HOLD_US: Final = 86_400_000_000
 """Time for which sigma includes a jump that has ended, µs: initial, largest, largest after motions."""
+LATE_US: Final = 500_000
+"""Largest delay of telemetry that the message about a jump allows for, µs."""
 CHECKPOINT_US: Final = 1_000_000
 CHECKPOINTS: Final = 64
 
@@ -93,6 +96,19 @@ class TrendState(NamedTuple):
     until_us: int
 
 
+class NewJump(NamedTuple):
+    """Jump that telemetry may still explain: its size (nT), the state before it, and its message.
+
+    Telemetry from `until_us` (µs) on explains it no more.
+    """
+
+    until_us: int
+    jump: float
+    before: TrendState
+    kind: str
+    text: str
+
+
 class TrendCheck:
     """Filter of the total field's trend that finds outliers and jumps; `scatter` estimates the noise.
 
@@ -113,7 +129,8 @@ class TrendCheck:
         self._before = nan  # prediction, if only a turn or a motion made the last sample acceptable
         self._accepted = 0
         self._unrest, self._decay, self._quiet = 0.0, SPIKE_DECAY, BURST_SAMPLES
-        self._candidate, self._agreed, self._candidate_us = nan, 0, 0
+        self._candidate, self._agreed, self._candidate_us = nan, 0, NEVER
+        self._new: NewJump | None = None
         self._home: TrendState | None = None  # prediction at which the field left its level
         self._away_us = NEVER  # time at which the field was last seen not to be back there
 
@@ -241,7 +258,7 @@ class TrendCheck:
             self._agreed += 1
             self._candidate += 0.5 * difference
         else:
-            self._candidate, self._agreed = total, 1
+            self._candidate, self._agreed, self._candidate_us = total, 1, time_us
         if self._agreed == AGREEING:
             assert self._now is not None
             back = self._candidate - self._before
@@ -251,7 +268,10 @@ class TrendCheck:
             self._agreed = 0
 
     def retract(self, since_us: int) -> None:
-        """Restore the state before `since_us` (µs), because a motion began that is reported only now."""
+        """Restore the state before `since_us` (µs), because a change began that is reported only now."""
+        if self._new is not None:  # by the times of arrival, the change may seem to be later than the jump
+            since_us = min(since_us, self._new.before.time_us)
+            self._now, self._new = self._new.before, None
         while self._checkpoints and self._checkpoints[-1].time_us > since_us:
             self._checkpoints.pop()
         if self._checkpoints and self._now is not None and self._now.time_us > since_us:
@@ -259,8 +279,24 @@ class TrendCheck:
         self._agreed, self._unrest, self._quiet = 0, 0.0, BURST_SAMPLES
         self.has_moved = True
 
+    def follow_telemetry(self, time_us: int, total: float) -> None:
+        """Retract a new jump if changed telemetry brings the `total` field back to the level before it."""
+        if self._new is not None:
+            before = self._new.before
+            level = before.level + 1e-6 * (time_us - before.time_us) * before.slope
+            if abs(total - level) < 0.5 * abs(self._new.jump):
+                self.retract(before.time_us)
+
+    def confirm(self, reported_us: int) -> None:
+        """Report a new jump that telemetry of the time `reported_us` (µs) has not explained."""
+        if self._new is not None and reported_us >= self._new.until_us:
+            self._messages.report(self._new.kind, self._new.text)
+            self._new = None
+
     def explain(self, difference: float) -> None:
         """Shift the level by `difference` (nT), by which a new calibration changes the total field."""
+        if self._new is not None:
+            self.confirm(self._new.until_us)
         if self._now is not None:
             self._now = self._now._replace(level=self._now.level + difference)
         if self._home is not None:
@@ -299,11 +335,12 @@ class TrendCheck:
             since_us=since_us,
             until_us=until_us,
         )
+        kind, why = "jump", ", which no telemetry explains"
         if by_motion:
-            text = f"field jumps by {jump:+.0f} nT as a mass moves: calibration or telemetry wrong"
-            self._messages.report("move", text)
-        else:
-            self._messages.report("jump", f"field jumps by {jump:+.0f} nT, which no telemetry explains")
+            kind, why = "move", " as telemetry changes: calibration or telemetry wrong"
+        if self._new is None:
+            text = f"field jumps by {jump:+.0f} nT{why}"
+            self._new = NewJump(self._candidate_us + LATE_US, jump, now, kind, text)
 
     def _is_return(self, state: TrendState, jump: float, total: float, noise: float) -> bool:
         """Return True if a `jump` (nT) from `state` ends the jumps, whose sum is then `total`, nT."""
