@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 from scipy.linalg import block_diag, solve_discrete_are
 from scipy.optimize import minimize
-from scipy.signal import sosfilt, zpk2sos
+from scipy.signal import sosfilt
 from scipy.special import chdtrc
 from threadpoolctl import threadpool_limits
 
@@ -81,6 +81,8 @@ NOISE_STARTS_NT = 0.1, 1.0, 10.0
 """Amplitudes of the slow processes from which the search starts: the evidence has several maxima."""
 WIDTH_GRID_SIGMA = np.linspace(-3.0, 3.0, 13)
 """Grid of the log of a width about its prior's centre, in prior sigmas."""
+NOISE_STEP = 1e-3
+"""Step of the logs of the noise with which the gradient is computed."""
 START_ITERATIONS, EVIDENCE_ITERATIONS = 5, 25
 """Iterations of the search from each start, and of the search from the best of them."""
 LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
@@ -416,8 +418,8 @@ class _ScalarProblem:
             log_det += float(np.log1p(s).sum())
         return both[:, 0], both[:, 1:], log_det
 
-    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> _Posterior | None:
-        """Return the posterior given the noise, with the widths that maximise the evidence.
+    def information(self, log_noise: FloatArray) -> tuple[GaussianInformation, float] | None:
+        """Return the information of the whitened samples, and the cost of the noise itself.
 
         None if the noise has no stable whitening filter.
         """
@@ -428,9 +430,32 @@ class _ScalarProblem:
         if not np.isfinite(X).all():
             return None
         data = GaussianInformation(X.T @ X, X.T @ y, float(y @ y))
-        found = _choose_widths(data, self.family, log_widths)
-        cost = found.cost + 0.5 * log_det - _log_noise_prior(log_noise)
-        return replace(found, log_noise=log_noise, cost=cost)
+        return data, 0.5 * log_det - _log_noise_prior(log_noise)
+
+    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> _Posterior | None:
+        """Return the posterior given the noise, with the widths that maximise the evidence, or None."""
+        given = self.information(log_noise)
+        if given is None:
+            return None
+        found = _choose_widths(given[0], self.family, log_widths)
+        return replace(found, log_noise=log_noise, cost=found.cost + given[1])
+
+    def slope(self, state: _Posterior, upper: FloatArray) -> FloatArray:
+        """Return the gradient of the cost by the noise, whose values may not exceed `upper`.
+
+        Notes
+        -----
+        By the envelope theorem the widths at their maximum stay as they are: their own change adds nothing.
+        """
+        slope = np.zeros(len(state.log_noise))
+        for k in range(len(slope)):
+            moved = state.log_noise.copy()
+            moved[k] += NOISE_STEP if moved[k] + NOISE_STEP <= upper[k] else -NOISE_STEP
+            given = self.information(moved)
+            if given is not None:
+                evidence, _, _ = log_evidence(given[0], self.family, state.log_widths, 0.0)
+                slope[k] = (given[1] - evidence - state.cost) / (moved[k] - state.log_noise[k])
+        return slope
 
     def optimise(self, *, map_known: bool, start: FloatArray | None) -> _Posterior:
         """Maximise the evidence over the noise, and for each noise over the widths."""
@@ -441,19 +466,19 @@ class _ScalarProblem:
         limits = [(-9.0, 9.0)] * (1 + len(TIME_CONSTANTS_S))
         limits += [(-3.0, 7.0), (-3.0, 7.0), (float(np.log(2.0 * self.interval)), LOG_LONGEST_CRUST)]
 
-        def cost(log_noise: FloatArray) -> float:
+        def cost(log_noise: FloatArray) -> tuple[float, FloatArray]:
             nonlocal warm, best
             state = self.posterior(log_noise, warm)
             if state is None:
-                return REFUSED_COST
+                return REFUSED_COST, np.zeros(len(log_noise))
             if best is None or state.cost < best.cost:
                 best, warm = state, state.log_widths
-            return state.cost
+            return state.cost, self.slope(state, np.array(limits)[:, 1])
 
         def search(start: FloatArray, iterations: int) -> FloatArray:
             found = minimize(
-                cost, start, method="L-BFGS-B", bounds=limits[: len(start)],
-                options={"maxiter": iterations, "ftol": 1e-6, "eps": 1e-3},
+                cost, start, jac=True, method="L-BFGS-B", bounds=limits[: len(start)],
+                options={"maxiter": iterations, "ftol": 1e-6},
             )  # fmt: skip
             return np.asarray(found.x)
 
@@ -678,11 +703,9 @@ class _SlowNoise:
         P = solve_discrete_are(A.T, C[:, None], Q + 1e-12 * np.eye(len(Q)), np.array([[white]]))
         variance = float(C @ P @ C) + white
         K = A @ P @ C / variance
-        sections = zpk2sos(zeros, np.linalg.eigvals(A - np.outer(K, C)), 1.0)
+        sections = np.hstack([_quadratics(zeros), _quadratics(np.linalg.eigvals(A - np.outer(K, C)))])
         size, axes = np.linalg.eigh(stationary - P)
-        return _SlowNoise(
-            np.asarray(sections), variance, axes * np.sqrt(np.maximum(size, 0.0)), tuple(lengths)
-        )
+        return _SlowNoise(sections, variance, axes * np.sqrt(np.maximum(size, 0.0)), tuple(lengths))
 
     def initial_effect(self, elapsed: FloatArray) -> FloatArray:
         """Return the effect (n, q) of the initial state's remainder, nT, `elapsed` (n,) s after it: C A^t."""
@@ -692,6 +715,14 @@ class _SlowNoise:
             row = np.exp(-x)[:, None] * np.stack([1.0 + x + 0.5 * x * x, x + x * x, 0.5 * x * x], axis=1)
             effect = np.hstack([effect, row])
         return np.asarray(effect @ self.remainder)
+
+
+def _quadratics(roots: FloatArray) -> FloatArray:
+    """Return the polynomials (n / 2, 3) whose product has the real roots and conjugate pairs (n,)."""
+    # complex roots first, conjugates adjacent; all sections are stable in any pairing
+    roots = roots[np.lexsort((roots.real, np.isreal(roots)))]
+    a, b = roots[::2], roots[1::2]
+    return np.stack([np.ones(len(a)), -(a + b).real, (a * b).real], axis=1)
 
 
 def _matern_transition(
