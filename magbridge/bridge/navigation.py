@@ -23,7 +23,7 @@ from magbridge.link.telemetry import own_time, sent_us
 from magbridge.mavlink import Message, by_id, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.navigate import NavigationOptions, NavigationState, Navigator, Record
-from magbridge.navigate.gnss import GnssMonitor, GnssReason, GnssState
+from magbridge.navigate.gnss import UNSTATED_SIGMA_M, GnssMonitor, GnssReason, GnssState
 from magbridge.navigate.options import at_depth, informed
 from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
@@ -282,8 +282,8 @@ GPS_AGE_S, GPS_AGE_SIGMA_S = 0.15, 0.1
 message."""
 MAX_GPS_DELAY_S = 10.0
 """Largest time by GPS_RAW_INT's own time stamp for which it waited, s; the clocks disagree beyond."""
-UNKNOWN_MOTION = 65535
-"""Value of GPS_RAW_INT.vel and .cog that means 'unknown'."""
+UNKNOWN_VALUE = 65535
+"""Value of GPS_RAW_INT.eph, .vel and .cog that means 'unknown'."""
 STATE_TEXTS = {
     NavigationState.OFF: "waiting for a first position",
     NavigationState.SEARCHING: "searching",
@@ -359,17 +359,16 @@ class NavigationService:
         if message["fix_type"] < FIX_3D or not (message["lat"] or message["lon"]):
             return
         latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
-        accuracy = message["h_acc"] * 1e-3
-        if UNKNOWN_MOTION not in (message["vel"], message["cog"]):
+        # without a stated accuracy (MAVLink 1 has no field for it), that of satellite positioning times HDOP
+        hdop = message["eph"] * 0.01 if 0 < message["eph"] < UNKNOWN_VALUE else 1.0
+        sigma = message["h_acc"] * 1e-3 or UNSTATED_SIGMA_M * max(hdop, 1.0)
+        if UNKNOWN_VALUE not in (message["vel"], message["cog"]):
             # the vehicle has moved on since the receiver's measurement
             speed, course = message["vel"] * 1e-2, radians(message["cog"] * 1e-2)
             delay, delay_sigma = self._delay(message, time_us)
             moved = (GPS_AGE_S + delay) * speed
             latitude, longitude = offset(latitude, longitude, moved * cos(course), moved * sin(course))
-            accuracy = (
-                hypot(accuracy, GPS_AGE_SIGMA_S * speed, delay_sigma * speed) if accuracy > 0.0 else accuracy
-            )
-        sigma = accuracy if accuracy > 0.0 else None
+            sigma = hypot(sigma, GPS_AGE_SIGMA_S * speed, delay_sigma * speed)
         self.motion.rise(time_us)
         self._notify(self.navigator.gnss_position(time_us, latitude, longitude, sigma))
         gnss = self.navigator.gnss

@@ -35,13 +35,16 @@ from magbridge.navigate.options import NavigationOptions, wider_level
 from magbridge.navigate.record import Rival
 from magbridge.records import NEVER
 
-__all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
+__all__ = ["UNSTATED_SIGMA_M", "GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
 MAX_DEVIATION_SIGMA = 4.5
 """Largest accepted deviation from a prediction, in sigmas; 4e-5 of right positions exceed it by chance (two
 degrees of freedom)."""
 MIN_SIGMA_M = 1.5
 """Lower limit of a claimed position sigma, m: a receiver's error changes slowly."""
+UNSTATED_SIGMA_M = 6.0
+"""1-sigma on each axis of a receiver that states no accuracy, m: at the worst site, GPS alone errs by at most
+15 m for 95 % of the time (GPS SPS performance standard 2020, table 3.8-3)."""
 MAX_RETURN_SIGMA, MAX_HOLD_US = 2.0, 180_000_000
 """Largest change of the positions against dead reckoning, in its sigmas, with which rejected positions are
 used again; 14 % of right changes exceed it by chance. The limit holds for the second value, in µs, because a
@@ -68,8 +71,8 @@ MAX_GNSS_AGE_US = 10_000_000
 CORRELATION_TIME_S = 30.0
 """Correlation time of the errors of successive positions that are fused, s."""
 JITTER_TIME_S = 5.0
-"""Correlation time of these errors in the comparison with the field, s: with a longer one, their white part
-would count as evidence against the positions."""
+"""Shortest correlation time of these errors in the comparison with the field, s, and that of an error of
+MIN_SIGMA_M: with a longer one, their white part would count as evidence against the positions."""
 SEPARATION_TIME_S, SEPARATION_INTERVAL_S = 240.0, 80.0
 """Time for which a comparison filter runs without the positions, and time from the start of one to the start
 of the next, s: one of them began shortly before a carry-off does."""
@@ -362,7 +365,10 @@ class _FieldTest:
     -----
     Both are sums of log-likelihood ratios ``log p(y_k | y_1 .. y_k-1, H1) - log p(y_k | y_1 .. y_k-1, H0)``.
     Under H1 the vehicle is at the receiver's position; the position error is Gauss-Markov with the receiver's
-    sigma and :data:`JITTER_TIME_S`. Calibration bias and map error are free states, as in the navigator.
+    sigma s. Its correlation time is ``2 s^2 / q``, with q the rate (m^2/s) at which the variance of the
+    positions against dead reckoning is seen to grow: a claimed error of many metres that changed within
+    seconds would predict a scatter of the field that right positions do not have. Calibration bias and map
+    error are free states, as in the navigator.
     Under H0 the vehicle is at the navigator's position, which has not used the receiver's. Both predict each
     measurement from all earlier ones. The first measurement does not count: it determines the bias under H1.
     """
@@ -382,6 +388,7 @@ class _FieldTest:
         self._filtered = np.zeros(2)  # position at the last measurement
         self._positions: deque[tuple[int, float, float]] = deque(maxlen=RECENT_POSITIONS)
         self._sigma, self._time_us = inf, NEVER  # no comparison before the next position
+        self._pace, self._wander, self._steps = np.zeros(2), 0.0, 0
         self._step = Step()  # since the last measurement that was used
 
     def unaided(self, *, by_field: bool) -> Bank | None:
@@ -408,8 +415,18 @@ class _FieldTest:
         """
         if restart or time_us - self._time_us > MAX_GNSS_AGE_US:
             self.restart()
+        elif time_us > self._time_us:
+            self._watch((time_us - self._time_us) * 1e-6, np.array(offset_m) - self._positions[-1][1:])
         self._positions.append((time_us, *offset_m))
         self._sigma, self._time_us = sigma, time_us
+
+    def _watch(self, seconds: float, step: FloatArray) -> None:
+        """Update mean rate (m/s) and growth of variance (m^2/s) of the positions against dead reckoning."""
+        self._steps += 1
+        share = max(1.0 / self._steps, min(seconds / CORRELATION_TIME_S, 1.0))
+        scatter = step - self._pace * seconds
+        self._wander += share * (float(scatter @ scatter) / (2.0 * seconds) - self._wander)
+        self._pace = self._pace + share * (step / seconds - self._pace)
 
     def begin_comparison(self) -> None:
         """Discard evidence except that against the map: from now on the navigator rejects the positions."""
@@ -465,7 +482,9 @@ class _FieldTest:
         position = np.array([np.interp(time_us, times, north), np.interp(time_us, times, east)])
         F, Q = transition(self._options, *step)
         F[:4], Q[:4] = 0.0, 0.0
-        kept = exp(-step.seconds / JITTER_TIME_S)
+        # correlation time 2 s^2 / q, and not below the shortest
+        wander = max(self._wander, 2.0 * MIN_SIGMA_M**2 / JITTER_TIME_S)
+        kept = exp(-step.seconds * min(0.5 * wander / self._sigma**2, 1.0 / JITTER_TIME_S))
         F[0, 0] = F[1, 1] = kept
         Q[0, 0] = Q[1, 1] = self._sigma**2 * (1.0 - kept * kept)
         bank.x[:2] -= self._filtered[:, None]

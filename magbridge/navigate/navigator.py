@@ -20,7 +20,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import widest
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.estimate import Estimate
-from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
+from magbridge.navigate.gnss import UNSTATED_SIGMA_M, GnssMonitor, GnssState, Prediction
 from magbridge.navigate.model import Block, Collector, block_length, transition
 from magbridge.navigate.options import NavigationOptions, lasting_errors
 from magbridge.navigate.record import NavigationState, Reckoned, Record
@@ -87,12 +87,13 @@ class Navigator:
     ) -> Record | None:
         """Test a GNSS position, and fuse it if it passes; return the update that this completes, or None.
 
-        Parameters are as in :meth:`fix`; :attr:`gnss` has the result of the test.
+        `sigma` is the 1-sigma that the receiver states on each axis, m; default :data:`UNSTATED_SIGMA_M`.
+        :attr:`gnss` has the result of the test.
         """
         if not (isfinite(latitude) and isfinite(longitude)):
             return None
         place, monitor, estimate = (latitude, longitude), self.gnss, self.estimate
-        known = estimate.options.start_sigma if sigma is None else sigma
+        known = UNSTATED_SIGMA_M if sigma is None else sigma
         self._reckoning.advance(time_us * 1e-6)
         if not estimate.begun:
             # There is no estimate to compare with: only the receiver's own report counts.
@@ -110,7 +111,7 @@ class Navigator:
             estimate.rivals = monitor.rivals(time_us)
         if state is not GnssState.GOOD:
             return None
-        return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
+        return self._correct(time_us, place, known, monitor.fused_sigma(time_us, known))
 
     def _prediction(self, time_us: int) -> Prediction:
         """Return the predicted position at `time_us`, not earlier than the last update."""

@@ -71,3 +71,19 @@ def test_the_odds_of_a_false_position_fall(north: float, east: float) -> None:
     flights = [log_odds(seed, (north, east)) for seed in range(1, 4)]
     assert max(odds[:, 1].max() for odds in flights) < np.log(45.0)
     assert all(odds[60:, 1].max() < -2.0 for odds in flights)
+
+
+@pytest.mark.parametrize("stated", [None, 20.0, 50.0])
+def test_a_right_receiver_that_states_a_large_error_or_none_is_used(stated: float | None) -> None:
+    """A slow vehicle on a smooth map, with a receiver that is better than it states."""
+    rng, grid = np.random.default_rng(4), synthetic(Map(120.0, 600.0), 4)
+    error = np.stack([gauss_markov(rng, 121, 2.0, 30.0) for _ in range(2)], axis=1)
+    navigator = Navigator(grid, AIRCRAFT)
+    for k in range(121):
+        now_us = int((START + k) * 1e6)
+        latitude, longitude = offset(*PLACE, 1.5 * k, 0.0)
+        navigator.telemetry(now_us, heading=0.0, speed=1.5)
+        navigator.gnss_position(now_us, *offset(latitude, longitude, *error[k].tolist()), stated)
+        field = total_field(longitude, latitude, 0.0, START + k) + grid.evaluate(longitude, latitude).anomaly
+        navigator.measure(now_us + 1, field.item() + rng.normal(), 1.0)
+        assert navigator.gnss.state is GnssState.GOOD
