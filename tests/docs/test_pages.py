@@ -8,12 +8,15 @@ from pathlib import Path
 import pytest
 from pages import PAGES, ROOT
 
+from magbridge.config import Align
+from magbridge.link.parameters import alignment, file_rate, learning
+
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
-def rows(heading: str) -> list[list[str]]:
+def rows(heading: str, page: str = PAGE) -> list[list[str]]:
     """Return the cells of the table below a heading."""
-    section = PAGE[PAGE.index(f"## {heading}\n") :].split("\n## ")[0]
+    section = page[page.index(f"## {heading}\n") :].split("\n## ", maxsplit=1)[0]
     lines = [line for line in section.splitlines() if line.startswith("| ")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
 
@@ -31,6 +34,18 @@ def test_every_place_exists() -> None:
     places = re.findall(r"`([\w/]+(?:\.py|\.xml|/))`", PAGE)
     assert len(places) > 20
     assert not [one for one in places if not ((ROOT / one).exists() or (ROOT / "magbridge" / one).exists())]
+
+
+def test_every_parameter_of_the_link_is_in_the_table() -> None:
+    page = (ROOT / "docs" / "mavlink.md").read_text(encoding="utf-8")
+    shown = re.findall(r"`(MB_\w+)`", " ".join(row[0] for row in rows("Parameters", page)))
+    assert sorted(shown) == sorted(one.name for one in [*alignment(Align()), *file_rate(), *learning(False)])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_key_of_the_alignment_exists(page: Path) -> None:
+    named = re.findall(r"`align\.(?!py`)(\w+)`", page.read_text(encoding="utf-8"))
+    assert set(named) <= set(Align.__struct_fields__)
 
 
 def test_every_central_type_is_in_its_module() -> None:
