@@ -7,15 +7,16 @@ to the file.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from math import inf, isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
 
 from magbridge.constants import MAIN_FIELD_SIGMA_NT
-from magbridge.errors import ConfigError
+from magbridge.errors import ConfigError, DataError
 from magbridge.toml import Table, check_entries, convert, load_toml
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "NotNegative", "Positive", "Sensor", "Telemetry", "load", "parse",
 ]  # fmt: skip
 
+T = TypeVar("T")
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
 """`Positive`, `NotNegative`: Numbers with an upper bound, because deadlines and sizes become integers."""
@@ -296,6 +298,18 @@ class Config(Table, frozen=True):
     def resolve(self, name: str) -> Path:
         """Return the path of a file named in the configuration, relative to the configuration's folder."""
         return self.path.parent / Path(name).expanduser()
+
+    def read(self, key: str, reader: Callable[[Path], T]) -> T | None:
+        """Return what `reader` reads from the file of a `key` of :attr:`files`; None without this key.
+
+        ConfigError: `reader` raises a DataError.
+        """
+        if (name := self.files[key]) is None:
+            return None
+        try:
+            return reader(self.resolve(name))
+        except DataError as error:
+            raise ConfigError(self.path, key, str(error)) from error
 
 
 def load(path: str | Path) -> Config:

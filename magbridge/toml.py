@@ -83,7 +83,17 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
             sentence = f"expected one of {', '.join(_valid(kind, keys))}, not {match[1]}"
         elif (match := re.match(r"([\w.]+): ", sentence)) and match[1].split(".")[0] in _valid(kind, keys):
             keys, sentence = f"{keys}.{match[1]}".lstrip("."), sentence[match.end() :]
+        elif re.match("Expected (?!.*, got)", sentence) and (value := _value(table, keys)) is not None:
+            sentence += f", got {value!r}"
         raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error
+
+
+def _value(table: Any, keys: str) -> Any:
+    """Return the value at the dotted path `keys`; None if the path has the unknown entry ``[...]``."""
+    for key in re.findall(r"[^.[\]]+|\.\.\.", keys):
+        entries = dict(enumerate(table)) if isinstance(table, list) else table
+        table = entries.get(int(key) if key.isdigit() else key) if isinstance(entries, dict) else None
+    return table
 
 
 def _valid(kind: Any, keys: str) -> list[str]:

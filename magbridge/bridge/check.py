@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from magbridge.bridge.devices import sensor_port
 from magbridge.bridge.events import Event, HostClock, LiveEdge
-from magbridge.bridge.learning import first_calibration, open_learner
+from magbridge.bridge.learning import CALIBRATION_KEYS, first_calibration, open_learner
 from magbridge.bridge.links import LINKS, nmea_port, open_link
 from magbridge.bridge.pipeline import Pipeline, drive
 from magbridge.bridge.port import cut
@@ -39,7 +39,6 @@ from magbridge.toml import load_toml
 
 __all__ = ["LISTEN_TIME_S", "ConfigFault", "LiveCheck", "access", "findings"]
 
-CALIBRATION_KEYS = ("calibration.file", "learning.prior")
 MIN_FREE_BYTES = 100e6
 """Free space that the disk of the log should have, bytes."""
 
@@ -130,8 +129,8 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
         yield from _device(config, "link.url", config.link.url.removeprefix("serial:"))
     yield from _tried(lambda: nmea_port(config))
     yield from _tried(lambda: ports(config))
-    if config.link.signing_key and (key := config.resolve(config.link.signing_key)).exists():
-        yield from _tried(lambda: load_key(key))
+    if config.link.signing_key and config.resolve(config.link.signing_key).exists():
+        yield from _tried(lambda: config.read("link.signing_key", load_key))
     for name, one in config.telemetry.items():
         yield from _tried(partial(TelemetryMap, {name: one}, config.link.autopilot, path))
         yield from _unmatched(name, one, path)
@@ -286,6 +285,8 @@ RATE_INTERVALS = 4
 SENT: Final = frozenset(spec(name).id for name in ("HEARTBEAT", "TIMESYNC", "COMMAND_LONG"))
 """Ids of the messages that the check sends; a router forwards messages only to senders of heartbeats."""
 SYSTEM_TIME: Final = spec("SYSTEM_TIME").id
+MAX_MATCHES = 10
+"""Number of values that a message of missing telemetry lists."""
 ARDUPILOT_GROUPS: Final = {
     "ATTITUDE": "EXTRA1", "VFR_HUD": "EXTRA2", "EKF_STATUS_REPORT": "EXTRA3", "BATTERY_STATUS": "EXTRA3",
     "SYSTEM_TIME": "EXTRA3", "ESC_TELEMETRY_1_TO_4": "EXTRA3", "RPM": "EXTRA3", "SYS_STATUS": "EXT_STAT",
@@ -341,14 +342,15 @@ class LiveCheck:
         self._telemetry = TelemetryMap(config.telemetry, own.autopilot, config.path)
         self._values: Counter[str] = Counter()
         self._unknown_values: Counter[str] = Counter()
+        self._arrived_matches = {name: set[str]() for name in config.telemetry}
         self._clock_difference_s = 0.0
         self._edge: LiveEdge | None = None
 
     def listen(self) -> None:
         """Read the ports for the duration of the check, then set the attributes with its results."""
-        config, link = self._config, self._link
+        config = self._config
         keeper, clock = Keeper(config), HostClock()
-        key = load_key(config.resolve(link.signing_key)) if link.signing_key else None
+        key = config.read("link.signing_key", load_key)
         start = keeper.start(clock.now_us())
         others = other_calibrations(config)
         config = replace(config, log=None, heading=HeadingOutput())
@@ -408,6 +410,10 @@ class LiveCheck:
         """Use a message of the vehicle: compare SYSTEM_TIME with the host's clock, count telemetry values."""
         if message.id == SYSTEM_TIME and message["time_unix_usec"] > YEAR_2001_US:
             self._clock_difference_s = (time_us - message["time_unix_usec"]) * 1e-6
+        for name, one in self._config.telemetry.items():
+            if one.match and spec(message.id).name == one.message:
+                fields = ", ".join(f"{field} = {message[field]!r}" for field in one.match)
+                self._arrived_matches[name].add(fields)
         for name, value, _ in self._telemetry.values(message, time_us, VehicleClock()):
             if self._config.telemetry[name].component in (None, message.component):
                 counts = self._unknown_values if isnan(value) else self._values
@@ -479,7 +485,9 @@ class LiveCheck:
         if not senders:
             return f"no {wanted.message} arrives: start its sender, or name another message"
         components = ", ".join(map(str, sorted(senders)))
-        return f"{wanted.message} of component {components} does not match: check match and component"
+        got = "; ".join(sorted(self._arrived_matches[name])[:MAX_MATCHES])
+        text = f"{wanted.message} of component {components} does not match: check match and component"
+        return f"{text}, got {got}" if got else text
 
     def _warn(self, key: str, text: str) -> None:
         place = f"{self._config.path}: {key}" if key else f"{self._config.path}"

@@ -18,8 +18,9 @@ from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
 if TYPE_CHECKING:
     from magbridge.learning import Learner  # imported with [learning] only: the bridge starts sooner
 
-__all__ = ["LearningService", "first_calibration", "keep", "kept_path", "open_learner"]
+__all__ = ["CALIBRATION_KEYS", "LearningService", "first_calibration", "keep", "kept_path", "open_learner"]
 
+CALIBRATION_KEYS = ("calibration.file", "learning.prior")
 ACCEPT, FORGET = 1.0, 2.0
 FILE_INTERVAL_US = 600_000_000
 """Shortest time between two files of a learned calibration that was only updated, µs."""
@@ -30,15 +31,14 @@ def first_calibration(config: Config) -> Calibration | None:
 
     Without ``[calibration]``, it is the file ``learning.prior``, or the generic prior of ``[learning]``.
 
-    FormatError, CalibrationError: a file is not a calibration.
+    ConfigError: a file is not a calibration.
     """
     settings = config.learning
-    if config.calibration is not None:
-        return load(config.resolve(config.calibration.file))
+    for key in CALIBRATION_KEYS:
+        if (calibration := config.read(key, load)) is not None:
+            return calibration
     if settings is None:
         return None
-    if settings.prior is not None:
-        return load(config.resolve(settings.prior))
     parameters = [
         Parameter(name, config.telemetry[name].unit if name in config.telemetry else "", low, high,
                   0.5 * (low + high), 0.5 * (high - low))
@@ -57,8 +57,7 @@ def open_learner(
     `config`: the bridge's configuration.
     `calibration`: the initial calibration.
     `currents`: names of telemetry in ampere; None for the ones in ``[telemetry]``.
-    ConfigError: the calibration cannot be updated in flight.
-    FormatError, OutOfRange: ``learning.reference`` is not a grid.
+    ConfigError: the calibration cannot be updated in flight, or ``learning.reference`` is not a grid.
     """
     if currents is None:
         currents = tuple(name for name, one in config.telemetry.items() if one.unit == "A")
@@ -71,7 +70,8 @@ def open_learner(
     if settings.reference != "igrf":
         from magbridge.field.read import read_grid  # noqa: PLC0415 - it brings scipy
 
-        grid = read_grid(config.resolve(settings.reference))
+        grid = config.read("learning.reference", read_grid)
+        assert grid is not None
         slope = sqrt(2.0) * grid.rms / grid.correlation_length
         spread = hypot(settings.map_sigma, slope * settings.position_sigma)
     try:

@@ -448,7 +448,7 @@ def set_up(config: Config, start: StartEvent) -> Pipeline:
     ConfigError, FormatError, CalibrationError: the configuration, or a file that it names, is not valid.
     """
     calibration = first_calibration(config)
-    key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
+    key = config.read("link.signing_key", load_key)
     navigate = None
     if config.navigation is not None:
         from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - where a map is used

@@ -107,10 +107,10 @@ def open_drivers(config: Config) -> list[Driver]:
 def other_calibrations(config: Config) -> dict[int, Calibration]:
     """Return the calibrations of the sensors after the first, by sensor id.
 
-    FormatError, CalibrationError: a file is not a calibration.
+    ConfigError: a file is not a calibration.
     """
-    named = {one.id or 0: one.calibration for one in config.more_sensors}
-    return {number: load(config.resolve(name)) for number, name in named.items() if name is not None}
+    read = {one.id or 0: config.read(f"{one.key}.calibration", load) for one in config.more_sensors}
+    return {number: calibration for number, calibration in read.items() if calibration is not None}
 
 
 def scalar_entry(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from math import isnan, nan, pi
@@ -57,6 +58,8 @@ class Extractor:
                 raise ConfigError(path, place, f"{kind}, not {value!r}")
             if isinstance(value, str) and len(value.encode()) > field.struct.size:
                 raise ConfigError(path, place, f"at most {field.struct.size} bytes, not {value!r}")
+            if not isinstance(value, str) and not can_be(field, value):
+                raise ConfigError(path, place, f"a value that {layout.name}.{one} can have, not {value:g}")
             self.match.append((field, value))
 
     def value(self, payload: bytes) -> float | None:
@@ -68,6 +71,15 @@ class Extractor:
         if self.index is not None:
             raw = raw[self.index]
         return nan if raw == self.field.invalid else self.scale * raw + self.offset
+
+
+def can_be(field: Field, value: float) -> bool:
+    """Return True if a number can be the value of a field: not 300 in a uint8, not 0.1 in a float."""
+    try:
+        packed = field.struct.pack(value if field.code in "fd" else int(value))
+    except (struct.error, ValueError, OverflowError):
+        return False
+    return bool(field.get(packed.rjust(field.offset + len(packed), b"\0")) == value)
 
 
 def find(layout: Spec, name: str, path: Path, key: str) -> Field:

@@ -92,8 +92,10 @@ BARE = GOOD.replace('[calibration]\nfile = "cal.json"\n', "")
 @pytest.mark.parametrize(
     ("text", "is_fatal", "words"),
     [
-        (BARE + '[learning]\nprior = "bridge.toml"', True, "not a calibration"),
-        (BARE + '[learning]\nreference = "bridge.toml"', True, "expected a grid"),
+        (GOOD.replace("cal.json", "."), True, "expected a file, not a directory"),
+        (GOOD.replace("cal.json", "."), True, "calibration.file: "),
+        (BARE + '[learning]\nprior = "bridge.toml"', True, "learning.prior: "),
+        (BARE + '[learning]\nreference = "bridge.toml"', True, "learning.reference: "),
         (BARE + "[learning]\nranges = {fin = [0.0, 1.0]}", True, "telemetry.fin: missing"),
         (GOOD + '[learning]\nreference = "none.nc"', True, "learning.reference: no such file"),
         (GOOD + '[learning]\nprior = "none.json"', True, "learning.prior: no such file"),
@@ -124,7 +126,9 @@ def test_what_run_would_end_at_or_warn_of(text: str, is_fatal: bool, words: str,
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        ("udpout:127.0.0.1:14550", "", "link.url: expected `str` of length >= 1"),
+        ("udpout:127.0.0.1:14550", "", "link.url: expected `str` of length >= 1, got ''"),
+        ("[link]", "[link]\nsystem = 0", "link.system: expected `int` >= 1, got 0"),
+        ("[link]", "[publish]\nMAG_RAW = nan\n[link]", "publish.MAG_RAW: expected `float` >= "),
         ("[link]", "[link]\ncomponent = 1", "link.component: expected another number than the autopilot's"),
         ('"hmr2300"', '"ascii"\noptions.columns = ["x"]', "sensor.options.columns: expected x, y and z,"),
         ("udpout:127.0.0.1:14550", "/dev/null", "sensor.port: expected another device than link.url, got"),
@@ -313,6 +317,7 @@ def test_live_names_the_systems_that_send_and_telemetry_that_does_not_match(
     check, _ = listened(rig)
     assert any(
         "telemetry.battpos: NAMED_VALUE_FLOAT of component 1 does not match" in one.text
+        and one.text.endswith(", got name = 'battpos'")
         for one in check.faults
     )
     rig.config.write_text(text.replace("[link]", "[link]\nsystem = 7"))

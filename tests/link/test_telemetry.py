@@ -118,6 +118,10 @@ def test_the_messages_own_time() -> None:
             Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "battery_position"}),
             r"telemetry.p.match.name: at most 10 bytes, not 'battery_position'",
         ),
+        (
+            Telemetry("SERVO_OUTPUT_RAW", "servo1_raw", match={"port": 300}),
+            r"telemetry.p.match.port: a value that SERVO_OUTPUT_RAW.port can have, not 300",
+        ),
         (Telemetry("BATTERY_STATUS", "id", match={"id": "a"}), r"telemetry.p.match.id: a number, not 'a'"),
     ],
 )
