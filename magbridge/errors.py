@@ -19,10 +19,11 @@ built-in error of its kind::
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 __all__ = [
-    "CalibrationError", "ConfigError", "DataError", "FormatError", "MagbridgeError", "MissingExtra",
-    "NoSolutionError", "OutOfRange", "PluginError", "PortError", "WriteError", "WrongUse",
+    "AbsentColumns", "CalibrationError", "ConfigError", "DataError", "FormatError", "MagbridgeError",
+    "MissingExtra", "NoSolutionError", "OutOfRange", "PluginError", "PortError", "WriteError", "WrongUse",
 ]  # fmt: skip
 
 
@@ -77,6 +78,14 @@ class FormatError(DataError, ValueError):
         self.file, self.expected, self.row, self.column = Path(file), expected, row, column
         where = ", ".join([f"row {row}"] * (row is not None) + [f"column {column!r}"] * bool(column))
         super().__init__(": ".join(part for part in (str(file), where, expected) if part))
+
+
+class AbsentColumns(FormatError):
+    """A file that lacks columns that the user declares."""
+
+    def __init__(self, file: str | Path, expected: str, names: tuple[str, ...], **where: Any) -> None:
+        self.names = names
+        super().__init__(file, expected, **where)
 
 
 class CalibrationError(DataError, ValueError):

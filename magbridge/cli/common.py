@@ -355,13 +355,17 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
         complain(f"and in {counted(len(lines) - MAX_NAMED_LOSSES, 'place')} more")
 
 
-def read_apart(files: Sequence[Path], reading: ReadingOptions) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
-    """Return the logs `files` and the sensor logs of `reading`, and the logs with sensor logs combined."""
+def read_apart(
+    files: Sequence[Path], reading: ReadingOptions
+) -> tuple[dict[Path, xr.Dataset], list[xr.Dataset], dict[Path, DataError]]:
+    """Return each log of `files` and `reading`, the logs with sensor logs combined, and the errors."""
+    from magbridge.logs.access import read_apart
     from magbridge.logs.merge import combine
 
-    logs = [mb.read(path, options=reading.without_sensor_logs) for path in (*files, *reading.sensor_log)]
-    named = [False] * len(files) + [True] * len(reading.sensor_log)
-    return logs, combine(logs, named, reading.clock_offset)
+    unnamed = [file for file in files if file not in reading.sensor_log]
+    logs, errors = read_apart([*unnamed, *reading.sensor_log], reading.options)
+    named = [path in reading.sensor_log for path in logs]
+    return logs, combine([*logs.values()], named, reading.clock_offset), errors
 
 
 def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:

@@ -62,11 +62,13 @@ def diagnose(
 
     known = mb.load(calibration)
     with waiting("reading") as step:
-        logs, combined = cli.read_apart(files, reading)
-        own = [path for path in files if digest(path) in known.inputs.values()]
-        own_logs = [log for path, log in zip(files, logs, strict=False) if path in own]
-        if len(combined) < len(logs):
-            logs, own_logs = combined, combined if own else []
+        apart, logs, errors = cli.read_apart(files, reading)
+        for error in errors.values():
+            raise error
+        own = [path for path in apart if digest(path) in known.inputs.values()]
+        own_logs = [apart[path] for path in own]
+        if len(logs) < len(apart):
+            own, own_logs = own[:1], logs if own else []
         cli.note_losses(*(log.attrs for log in logs))
         cli.note_unused_grid(grid, *logs)
         remarks = cli.warnings_of(known, calibration)

@@ -13,12 +13,11 @@ from cyclopts import Parameter, validators
 
 import magbridge as mb
 from magbridge.cli import common as cli
-from magbridge.errors import DataError, FormatError, WrongUse
+from magbridge.errors import WrongUse
 from magbridge.progress import track, waiting
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
-    import xarray as xr
     from rich.table import Table
 
 
@@ -43,40 +42,30 @@ def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.
     """
     if len(files) < 2:
         cli.logs_to_read(files)
-    from magbridge.logs.access import without_companions
     from magbridge.logs.deployment import join
     from magbridge.logs.info import info as facts_of
-    from magbridge.logs.merge import combine
 
     with waiting("reading"):
-        apart = without_companions([file for file in dict.fromkeys(files) if file not in reading.sensor_log])
-        every = (*apart, *reading.sensor_log)
-        logs: dict[str, xr.Dataset] = {}
-        failures: dict[str, str] = {}
-        for file in every:
-            try:
-                cli.logs_to_read((file,))
-                logs[str(file)] = mb.read(file, options=reading.without_sensor_logs)
-            except (FormatError, DataError) as error:
-                if len(every) == 1:
-                    raise
-                failures[str(file)] = str(error)
-                cli.complain(str(error))
-        named = [Path(name) in reading.sensor_log for name in logs]
-        combined = combine(list(logs.values()), named, reading.clock_offset)
+        apart, combined, errors = cli.read_apart(files, reading)
+        logs = {str(path): log for path, log in apart.items()}
+        count = len(apart) + len(errors)
+        for error in errors.values():
+            if count == 1:
+                raise error
+            cli.complain(str(error))
         if len(combined) < len(logs):
             names = [Path(name).name for name in logs]
             listed = " and ".join(names) if len(names) <= MAX_LISTED_LOGS else f"{len(names)} logs"
             logs[f"{listed} together"] = join(combined)
-    found: dict[str, dict[str, Any]] = {name: {"error": text} for name, text in failures.items()}
+    found: dict[str, dict[str, Any]] = {str(path): {"error": str(error)} for path, error in errors.items()}
     for name, log in logs.items():
         found[name] = facts_of(log)
         if not json:
             cli.note_losses(log.attrs)
             _show(name, found[name])
     cli.print_result(found, "", json)
-    if failures:
-        raise cli.FailedResult(f"{len(failures)} of {len(every)} logs cannot be read; see the lines above")
+    if errors:
+        raise cli.FailedResult(f"{len(errors)} of {count} logs cannot be read; see the lines above")
 
 
 def _show(file: str, facts: dict[str, Any]) -> None:

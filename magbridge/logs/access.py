@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from inspect import signature
 from itertools import accumulate, chain, pairwise
@@ -20,7 +21,7 @@ import xarray as xr
 
 from magbridge.columns import counts_from_boot, decoded, require, usual
 from magbridge.datasets import in_standard_units, increasing
-from magbridge.errors import FormatError, WriteError, WrongUse
+from magbridge.errors import AbsentColumns, DataError, FormatError, WriteError, WrongUse
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
 from magbridge.logs.checks import checked
@@ -112,6 +113,32 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
     return [files.counted(part) for part in combined]
 
 
+def read_apart(
+    paths: Sequence[Path], options: Options = DEFAULTS
+) -> tuple[dict[Path, xr.Dataset], dict[Path, DataError]]:
+    """Return the deployment of each readable file, none with telemetry of another, and the others' errors."""
+    logs: dict[Path, xr.Dataset] = {}
+    errors: dict[Path, DataError] = {}
+    there: list[Path] = []
+    for path in dict.fromkeys(paths):
+        try:
+            there += _paths(path, DEFAULTS)
+        except DataError as error:
+            errors[path] = error
+    files = _Files(without_companions(there), options)
+    for k, path in enumerate(files.paths):
+        try:
+            if pieces := [*files.pieces(k, ALL_ROWS)]:
+                log = _without_depth(join(pieces))
+                if options.strict:
+                    refuse_repeated(log)
+                logs[path] = log
+        except DataError as error:
+            errors[path] = error
+    errors |= files.bad
+    return logs, {path: errors[path] for path in paths if path in errors}
+
+
 def read_chunks(
     paths: Paths, rows: int = 65536, *, required: Iterable[str] = (), options: Options = DEFAULTS
 ) -> Iterator[xr.Dataset]:
@@ -142,20 +169,32 @@ class _Files:
 
     def __init__(self, paths: Sequence[Path], options: Options) -> None:
         self.paths, self._options = paths, options
-        self._bad: dict[Path, FormatError] = {}
+        self.bad: dict[Path, FormatError] = {}
+        """Errors of the unreadable files."""
+        self._lacking: dict[Path, set[str]] = {}
         self._reported = 0
         self._together: dict[int, Iterator[Any]] | None = None
 
     def pieces(self, k: int, rows: int) -> Iterator[xr.Dataset]:
-        """Yield the readable pieces of file `k`; FormatError: no file is readable, or options are strict."""
-        path = self.paths[k]
+        """Yield the readable pieces of file `k`; FormatError: no file is readable, or options are strict.
+
+        A declared column that this file lacks may be in another; AbsentColumns: it is in none.
+        """
+        path, options = self.paths[k], self._options
         if self._together is None:
             self._together = _read_together(self.paths, rows, self._options)
         try:
-            yield from _chunks(path, rows, self._options, self._together.pop(k, None))
+            try:
+                yield from _chunks(path, rows, options, self._together.pop(k, None))
+            except AbsentColumns as error:
+                self._lacking[path] = set(error.names)
+                is_last = len(self._lacking) == len(self.paths)
+                nowhere = set.intersection(*self._lacking.values()) if is_last else set()
+                elsewhere = tuple(self._lacking[path] - nowhere)
+                yield from _chunks(path, rows, replace(options, elsewhere=elsewhere))
         except FormatError as error:
-            self._bad[path] = error
-            if self._options.strict or len(self._bad) == len(self.paths):
+            self.bad[path] = error
+            if options.strict or len(self.bad) == len(self.paths) or isinstance(error, AbsentColumns):
                 raise
 
     def is_sensor_log(self, k: int) -> bool:
@@ -164,7 +203,7 @@ class _Files:
 
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
         """Return the deployment with attributes that count and name the files skipped since the last call."""
-        lines = [str(error) for error in self._bad.values()][self._reported :]
+        lines = [str(error) for error in self.bad.values()][self._reported :]
         self._reported += len(lines)
         dataset = _without_depth(dataset)
         return with_losses(dataset, {"files_skipped": len(lines)}, lines) if lines else dataset

@@ -16,12 +16,12 @@ from magbridge.columns import (
     COLUMNS,
     FURTHER_AXIS,
     NT_PER_UNIT,
+    absent,
     counts_from_boot,
-    require,
     usual,
 )  # fmt: skip
 from magbridge.datasets import conversion, in_standard_units, standard_log
-from magbridge.errors import FormatError
+from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.mapping import ColumnMapping, ColumnSource, split
 from magbridge.records import Quality
 
@@ -149,17 +149,23 @@ def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
-    """Return the deployment with columns renamed and scaled as declared, for formats with fixed names."""
+    """Return the deployment with columns renamed and scaled as declared, for formats with fixed names.
+
+    AbsentColumns: it lacks declared columns.
+    """
     taken: dict[str, Any] = {}
+    sources = {name: _column(dataset, name, source)[0] for name, source in declaration.columns.items()}
+    if lacking := {name: theirs for name, theirs in sources.items() if theirs not in dataset}:
+        first = next(iter(lacking.values()))
+        expected = absent(first, map(str, dataset.data_vars))
+        raise AbsentColumns(dataset.attrs["source"], expected, (*lacking,), column=first)
     for name, source in declaration.columns.items():
         theirs, unit = _column(dataset, name, source)
-        require(dataset, [theirs])
         values = source.scale * dataset[theirs].to_numpy() + source.offset
         unit = unit or str(dataset[theirs].attrs.get("units", ""))
         part = deployment(dataset.attrs["source"], dataset["time"].to_numpy(), {name: values}, {name: unit})
         taken[name] = part[name]
-    used = {_column(dataset, name, source)[0] for name, source in declaration.columns.items()}
-    named = dataset.drop_vars(used - declaration.columns.keys()).assign(taken)
+    named = dataset.drop_vars(set(sources.values()) - declaration.columns.keys()).assign(taken)
     reference = declaration.heading_reference
     return named.assign_attrs({"heading_reference": reference}) if reference else named
 

@@ -98,11 +98,15 @@ class Options:
     """Declarations of single columns, each ``NAME="THEIRS [unit]"``."""
     columns: Path | None = None
     """Mapping file (:class:`magbridge.logs.mapping.ColumnMapping`) that declares all columns of a log."""
+    elsewhere: tuple[str, ...] = ()
+    """Standard names of declared columns that another file has, and this one lacks."""
 
     @cached_property
     def declared(self) -> ColumnMapping:
         """Combined declarations of `columns` and `column`; raise ConfigError or WrongUse for a wrong one."""
-        return declared(self.column, self.columns)
+        every = declared(self.column, self.columns)
+        own = {name: source for name, source in every.columns.items() if name not in self.elsewhere}
+        return msgspec.structs.replace(every, columns=own)
 
 
 def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usual
-from magbridge.errors import FormatError
+from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
 from magbridge.logs.mapping import CELL_NUMBER, NAMES, ColumnSource, bare, is_unit, split
@@ -155,19 +155,24 @@ def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
 
 
 def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str]:
-    """Return index and standard name of each column that the user declares; FormatError: one is missing."""
+    """Return index and standard name of each declared column; AbsentColumns: some are missing."""
     taken: dict[int, str] = {}
+    lacking: dict[str, str] = {}
     for name, source in layout.declared.columns.items():
         theirs = source.heading or name
         if name == "time" and layout.rate:
             continue
         wanted = theirs, split(theirs)[0]
         found = [there.index(one) for there in (layout.headings, names) for one in wanted if one in there]
-        if not (free := [k for k in found if k not in taken]):
-            present = " ".join(repr(heading) if " " in heading else heading for heading in layout.headings)
-            expected = f"expected this column; there are: {present}"
-            raise FormatError(path, expected, row=layout.row, column=theirs)
-        taken[free[0]] = name
+        if free := [k for k in found if k not in taken]:
+            taken[free[0]] = name
+        else:
+            lacking[name] = theirs
+    if lacking:
+        present = " ".join(repr(heading) if " " in heading else heading for heading in layout.headings)
+        expected = f"expected this column; there are: {present}"
+        first = next(iter(lacking.values()))
+        raise AbsentColumns(path, expected, (*lacking,), row=layout.row, column=first)
     return taken
 
 

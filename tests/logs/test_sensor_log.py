@@ -1,5 +1,6 @@
 """Test that a sensor's log gets a vehicle's telemetry at the sensor's times, with gaps counted."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
+from log_files import segment
 
 from magbridge import logs
 from magbridge.errors import FormatError, WrongUse
 from magbridge.logs import Options
+from magbridge.logs.access import read_apart
 from magbridge.logs.deployment import deployment, noted, passed_over
 
 START = 1_700_000_000.0
@@ -111,6 +114,33 @@ def test_a_vehicle_with_a_compass_keeps_it_under_a_number(both: tuple[Path, Path
     assert log.sizes["time"] == 221
     assert float(log["mag_x"].median()) > 19_000.0
     assert float(log["mag2_z"].median()) == 3.0
+
+
+def test_a_declared_column_is_that_of_the_log_which_has_it(
+    both: tuple[Path, Path], tmp_path: Path, command: Command
+) -> None:
+    logger = tmp_path / "logger.csv"
+    head, rows = both[0].read_text().split("\n", 1)
+    logger.write_text(re.sub(r"mag_([xyz])[^,]*", r"F\1 [nT]", head) + "\n" + rows)
+    declared = ["mag_x=Fx", "mag_y=Fy", "mag_z=Fz", "piston=battpos"]
+    given = [word for one in declared for word in ("--column", one)]
+    for files in ([logger, both[1]], [both[1], logger]):
+        log = logs.read(files, options=Options(column=tuple(declared)))
+        assert (log.sizes["time"], "piston" in log, "battpos" in log) == (221, True, False)
+        np.testing.assert_array_equal(log["mag_y"], logs.read(both)["mag_y"])
+        assert "files_skipped" not in passed_over(log.attrs)
+        assert "together: 221 rows" in command("info", *files, *given).out
+        with pytest.raises(FormatError, match="column 'nowhere': expected this column"):
+            logs.read(files, options=Options(column=(*declared, "ballast=nowhere")))
+
+
+def test_a_slocums_science_file_is_not_read_apart(both: tuple[Path, Path], tmp_path: Path) -> None:
+    time = START + np.arange(0.0, 200.0, 4.0)
+    for name in ("flight.dbd", "flight.ebd"):
+        clock = "m_present_time" if name == "flight.dbd" else "sci_m_present_time"
+        segment(tmp_path / name, {clock: time, "m_lat": np.full(len(time), 4700.0)})
+    files = [both[0], tmp_path / "flight.dbd", tmp_path / "flight.ebd"]
+    assert [path.name for path in read_apart(files)[0]] == ["fluxgate.csv", "flight.dbd"]
 
 
 @pytest.mark.real
