@@ -73,8 +73,13 @@ HEADING_WORDS = {
     "mjd": "mjd|modified", "julian": "julian|^jd$",
 }  # fmt: skip
 """Kind of number -> pattern of the words in a heading that state it."""
-DAY_COUNT_RANGES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
-"""Kinds that count days, with the range of their numbers (1982 to 2064, 1943 to 2080, 1968 to 2077)."""
+DAY_COUNT_RANGES = (
+    ("excel", 3e4, 5.1e4),
+    ("mjd", 5.1e4, 6.6e4),
+    ("matlab", 7.1e5, 7.6e5),
+    ("julian", 2.44e6, 2.48e6),
+)
+"""Kinds that count days, with the range of their numbers (1982, 1998 to 2039, 1943 to 2080, 1968 to 2077)."""
 STEP, CERTAIN = 5e-4, 1e-4
 """Largest median step, days, with which a number counts days and not seconds since a boot: 43 s, or 9 s in a
 column named ``time``."""

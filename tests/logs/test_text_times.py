@@ -56,6 +56,7 @@ STAMPS = {
     "days by their unit": ("time [excel]", f"{44_685.5 + 0.5 / DAY:.9f}", f"{44_685.5 + 1.5 / DAY:.9f}"),
     "Julian days": ("julian date", f"{2_459_704 + 0.5 / DAY:.9f}", f"{2_459_704 + 1.5 / DAY:.9f}"),
     "modified Julian days": ("MJD", f"{59_703.5 + 0.5 / DAY:.9f}", f"{59_703.5 + 1.5 / DAY:.9f}"),
+    "modified days under our name": ("time", f"{59_703.5 + 0.5 / DAY:.9f}", f"{59_703.5 + 1.5 / DAY:.9f}"),
     "a heading of its own": (
         "loggingTime(txt)", "2022-05-04T09:30:00.5-02:30", "2022-05-04T09:30:01.5-0230"
     ),
