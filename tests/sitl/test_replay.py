@@ -88,6 +88,7 @@ def test_every_instrument_s_protocol_arrives_whole(
     # without a clock, a reading after a gap may have waited instead
     assert flags.pop("late_join", 0) <= (flags["gap"] if driver == "hmr2300" else 0)
     assert set(flags) <= {"uncalibrated", "no_boresight", "gap"}
+    assert "no_boresight" in summary(result)
     assert any("sends readings" in text for text in result["said"])
 
 
