@@ -44,7 +44,7 @@ def test_an_engineer_with_a_german_spreadsheet(walk: Walk, here: Path) -> None:
     theirs.engineer(here / "mine.csv")
     # which column is the time?
     assert "stern position [mm]" in walk("magbridge info mine.csv", code=1).err
-    (mapping,) = (one.text for one in blocks("toml") if "[columns.mag_x]" in one.text)
+    (mapping,) = (one.text for one in blocks("toml") if "[columns.time]" in one.text)
     (here / "columns.toml").write_text(mapping)
     assert "nT" in walk("magbridge info mine.csv --columns columns.toml").out
     walk(
