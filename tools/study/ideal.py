@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -260,13 +261,15 @@ def left_by_causes(draws: Draws, spans: Sequence[Span]) -> dict[str, float]:
 
 def p_values(draws: Draws, spans: Sequence[Span], look_elsewhere: Mapping[str, float]) -> FloatArray:
     """Return the smallest p-value of all tests for each of :data:`SIZES` and each draw, (sizes, DRAWS)."""
-    scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
+    scale, largest = SIZES / draws.wanted, {(1.0, 1.0): np.zeros((len(SIZES), 1))}  # a p-value of 1
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)
         if freedom:
             tests = span.tail * len(CAUSES) * look_elsewhere.get(span.cause, 1.0)
-            least = np.minimum(least, tests * chdtrc(freedom, np.maximum(ratio, 0.0)))
-    return least
+            largest[tests, freedom] = np.maximum(largest.get((tests, freedom), 0.0), ratio)
+    # of tests with the same distribution, that of the largest ratio has the smallest p-value
+    every = [tests * chdtrc(freedom, ratio) for (tests, freedom), ratio in largest.items()]
+    return np.asarray(reduce(np.minimum, every))
 
 
 def found_at(p: FloatArray) -> dict[str, float]:
