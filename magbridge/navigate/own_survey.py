@@ -314,14 +314,16 @@ class OwnField:
         x, y = self.place[n] + d, self.anomaly[n] - self.mean - (self.slope[n] * d).sum(axis=1)
         squared, k, h, K, R = self._covariance(x, size, length, noise)
         # log p = -y' K^-1 y / 2 - log |L| with K = L L'.
-        L, info = dpotrf(K.T, lower=1)
+        L, info = dpotrf(K.T, lower=1, overwrite_a=1)
         if info:
             return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
         # alpha = K^-1 y; d log p / dK = (alpha alpha' - K^-1) / 2 (Rasmussen & Williams 2006, eq. 5.9).
         alpha = dpotrs(L, y, lower=1)[0]
         value = -0.5 * float(y @ alpha) - float(np.log(L.diagonal()).sum())
-        inverse = np.tril(dpotri(L, lower=1)[0])
-        G = np.outer(alpha, alpha) - inverse - np.tril(inverse, -1).T  # twice the slope by K
+        lower = dpotri(L, lower=1, overwrite_c=1)[0]  # with zeros above
+        inverse = lower + lower.T
+        inverse.flat[:: count + 1] = lower.diagonal()
+        G = alpha[:, None] * alpha - inverse  # twice the slope by K
         # Chain rule: dK/dx through the distance, dK/d(log amplitude), dK/d(log length), dK/d(log noise).
         Gh = G * h
         steep = (size / length) ** 2
