@@ -72,31 +72,34 @@ def residuals(samples: ResidualSamples, coefficients: FloatArray) -> tuple[Float
     coefficients : (9 m,) array
         Coefficients, nT, monomial by monomial.
     """
-    # A and T at the positions of every sample, then the corrected vector b and its direction u
-    theta = samples.phi @ coefficients.reshape(-1, 9)
-    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
-    d = samples.field - theta[:, 6:]
+    # A and T at the positions of every sample, then the corrected vector b and its direction u; all by axes,
+    # (9, n), (6, n) and (3, n), because operations on short rows are slow
+    theta = coefficients.reshape(-1, 9).T @ samples.phi.T
+    A = theta[:6] / samples.F_0
+    A[:3] += 1.0
+    d = samples.field.T - theta[6:]
     b = _times(A, d)
-    F = np.sqrt((b * b).sum(axis=1))
-    u = b / F[:, None]
+    F = np.sqrt((b * b).sum(axis=0))
+    u = b / F
     # Sampson's weight: a channel's noise of 1 nT moves F by |A u| nT
     w = _times(A, u)
-    s2 = samples.kappa**2 + (w * w).sum(axis=1)
+    s2 = samples.kappa**2 + (w * w).sum(axis=0)
     s = np.sqrt(s2)
     e = (F - samples.reference) / s
     # the derivative of the weight, y, and of the residual: de = z^T dA d - (A z)^T dT - k w^T dA u
     v = _times(A, w)
-    y = (v - u * (u * v).sum(axis=1)[:, None]) / F[:, None]
-    k = (e / s2)[:, None]
-    z = u / s[:, None] - k * y
-    g = np.empty((len(e), 9))
+    y = (v - u * (u * v).sum(axis=0)) / F
+    k = e / s2
+    z = u / s - k * y
+    kw = k * w
+    g = np.empty((9, len(e)))
     for slot, (i, j) in enumerate(PAIRS):
-        g[:, slot] = z[:, i] * d[:, j] - k[:, 0] * w[:, i] * u[:, j]
+        g[slot] = z[i] * d[j] - kw[i] * u[j]
         if i != j:
-            g[:, slot] += z[:, j] * d[:, i] - k[:, 0] * w[:, j] * u[:, i]
-    g[:, :6] /= samples.F_0
-    g[:, 6:] = -_times(A, z)
-    return e, g
+            g[slot] += z[j] * d[i] - kw[j] * u[i]
+    g[:6] /= samples.F_0
+    g[6:] = -_times(A, z)
+    return e, np.ascontiguousarray(g.T)
 
 
 def residual_scale(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
@@ -104,11 +107,12 @@ def residual_scale(samples: ResidualSamples, coefficients: FloatArray) -> FloatA
 
     `coefficients` (9 m,): nT, monomial by monomial.
     """
-    theta = samples.phi @ coefficients.reshape(-1, 9)
-    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
-    b = _times(A, samples.field - theta[:, 6:])
-    w = _times(A, b) / np.linalg.norm(b, axis=1)[:, None]
-    return np.asarray(np.sqrt(samples.kappa**2 + (w * w).sum(axis=1)))
+    theta = coefficients.reshape(-1, 9).T @ samples.phi.T
+    A = theta[:6] / samples.F_0
+    A[:3] += 1.0
+    b = _times(A, samples.field.T - theta[6:])
+    w = _times(A, b) / np.linalg.norm(b, axis=0)
+    return np.asarray(np.sqrt(samples.kappa**2 + (w * w).sum(axis=0)))
 
 
 def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
@@ -144,8 +148,10 @@ def scales_and_offsets(samples: ResidualSamples, coefficients: FloatArray) -> tu
 
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the products (n, 3) of matrices (n, 3, 3) and vectors (n, 3)."""
-    return np.asarray(np.matmul(A, x[:, :, None])[:, :, 0])
+    """Return the products (3, n) of symmetric matrices, given as entries (6, n), and vectors (3, n)."""
+    xx, yy, zz, xy, xz, yz = A
+    a, b, c = x
+    return np.stack([xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c])
 
 
 def symmetric(entries: FloatArray) -> FloatArray:
