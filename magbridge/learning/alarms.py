@@ -24,8 +24,10 @@ like outliers to the other tests, so this test uses them even if the sensor seem
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
+from itertools import islice
 from math import log, sqrt
 from typing import Final, NamedTuple
 
@@ -244,9 +246,11 @@ class DelayTest:
 
     def reported_since(self, time_us: int, kept: Sequence[StoredSample]) -> StoredSample | None:
         """Return the stored sample about one delay older than `time_us`, or None if none is left to test."""
-        delay_us = self._delay_us
-        stored = min(kept, key=lambda one: abs(time_us - one.sample.time_us - delay_us), default=None)
-        if stored is None or abs(time_us - stored.sample.time_us - delay_us) > MAX_DELAY_ERROR * delay_us:
+        delay_us, then_us = self._delay_us, time_us - self._delay_us
+        after = bisect_left(kept, then_us, key=lambda one: one.sample.time_us)
+        nearest = list(islice(kept, max(after - 1, 0), after + 1))
+        stored = min(nearest, key=lambda one: abs(then_us - one.sample.time_us), default=None)
+        if stored is None or abs(then_us - stored.sample.time_us) > MAX_DELAY_ERROR * delay_us:
             return None
         if stored.sample.time_us <= self._tested_us:
             return None

@@ -68,7 +68,7 @@ def observe(field: Vector, nine: FloatArray, F_0: float, reference: float) -> Ob
     v, k = A @ w, e / s2
     z = u / s - k / F * (v - u * (u @ v))
     # derivative by the elements of A; an off-diagonal element occurs at two places
-    by_A = np.outer(z, d) - k * np.outer(w, u)
+    by_A = z[:, None] * d - k * (w[:, None] * u)
     both = by_A + by_A.T
     by_six = np.array((by_A[0, 0], by_A[1, 1], by_A[2, 2], both[0, 1], both[0, 2], both[1, 2]))
     return Observation(e, s, np.concatenate([by_six / F_0, -(A @ z)]))
@@ -291,7 +291,7 @@ class LearnedTerms:
 
     def derivative(self, phi: FloatArray, by_nine: FloatArray) -> FloatArray:
         """Convert a derivative by the nine coefficients (9,) to a derivative by all K coefficients (K,)."""
-        return np.asarray(self._flat @ np.outer(phi, by_nine).ravel())
+        return np.asarray(self._flat @ (phi[:, None] * by_nine).ravel())
 
     def _index(self, used: Sequence[int]) -> IndexArray:
         """Return the indices of the coefficients of a calibration with the further channels `used`."""
