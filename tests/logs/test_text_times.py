@@ -246,7 +246,7 @@ def test_counts_go_on(rows: int, tmp_path: Path) -> None:
         assert np.flatnonzero(np.diff(time) > 1.0).tolist() == [24]
 
 
-@pytest.mark.parametrize("rows", [7, 1 << 16])
+@pytest.mark.parametrize("rows", [50, 1 << 16])
 @pytest.mark.parametrize("late", [4, 2000])
 @pytest.mark.parametrize("form", ["%Y-%m-%d,%H:%M:%S", "%Y,%m,%d,%H,%M,%S"])
 def test_a_date_that_stays_at_midnight(form: str, late: int, rows: int, tmp_path: Path) -> None:
