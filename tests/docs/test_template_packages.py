@@ -101,32 +101,32 @@ def test_a_record_that_is_none_is_named(installed: Path) -> None:
     assert "bad.survey: row 2: expected a time and 6 numbers" in output.stdout + output.stderr
 
 
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ("import nowhere_to_be_found\n", "ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
-        (
-            "def chunks(path, rows):\n    yield 1 / 0\n",
-            "ZeroDivisionError: division by zero (faulty.py, line 2)",
-        ),
-        ("def chunks(path, rows):\n    yield {}\n", "expected deployments (xarray.Dataset), not dict"),
-        ("read = None\n", "lacks chunks(path, rows)"),
-    ],
-    ids=["import", "raises", "yields", "lacks"],
-)
-def test_a_faulty_format_is_one_line_and_harms_nothing_else(text: str, fault: str, tmp_path: Path) -> None:
-    declare(tmp_path, "faulty", {"magbridge.formats": {"odd": "faulty"}})
-    (tmp_path / "faulty.py").write_text(text)
-    (tmp_path / "log.odd").write_text("x")
-    output = magbridge(tmp_path, "convert", tmp_path / "log.odd", "-o", tmp_path / "log.csv", code=1).stderr
-    assert output.startswith("magbridge: format 'odd' of the package faulty: ")
-    assert fault in output
-    assert output.count("\n") == 1
-    assert not (tmp_path / "log.csv").exists()
+FAULTS = {
+    # format: its module's text, and what is said
+    "gone": ("import nowhere_to_be_found\n", "ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
+    "raises": (
+        "def chunks(path, rows):\n    yield 1 / 0\n",
+        "ZeroDivisionError: division by zero (faulty_raises.py, line 2)",
+    ),
+    "yields": (
+        "def chunks(path, rows):\n    yield {}\n", "expected deployments (xarray.Dataset), not dict"
+    ),
+    "lacks": ("read = None\n", "lacks chunks(path, rows)"),
+}  # fmt: skip
+
+
+def test_a_faulty_format_is_one_line_and_harms_nothing_else(tmp_path: Path) -> None:
+    declare(tmp_path, "faulty", {"magbridge.formats": {name: f"faulty_{name}" for name in FAULTS}})
+    for name, (text, fault) in FAULTS.items():
+        (tmp_path / f"faulty_{name}.py").write_text(text)
+        (tmp_path / f"log.{name}").write_text("x")
+        output = magbridge(tmp_path, "convert", f"log.{name}", "-o", "log.csv", code=1).stderr
+        assert output.startswith(f"magbridge: format '{name}' of the package faulty: ")
+        assert fault in output
+        assert output.count("\n") == 1
+        assert not (tmp_path / "log.csv").exists()
     sound = ROOT / "examples" / "format" / "sample.survey"
-    assert (
-        "ends in one of" in magbridge(tmp_path, "convert", sound, "-o", tmp_path / "log.csv", code=1).stderr
-    )
+    assert "ends in one of" in magbridge(tmp_path, "convert", sound, "-o", "log.csv", code=1).stderr
 
 
 def test_the_cause_is_put_forward_found_and_explained(
