@@ -32,6 +32,7 @@ from magbridge.calibration.fitting.field_search import (
     climb,
     ladder,
     nodes_for,
+    too_coarse,
 )
 from magbridge.calibration.fitting.scalar_fit import is_significant
 from magbridge.diagnostics import Diagnostic
@@ -63,7 +64,7 @@ SCANNED_SAMPLES, SCANNED_NODES = 4_000, 3_000
 """Largest numbers of samples and nodes of the scan."""
 MAX_SPACING_FRACTION = 1.0 / 240.0
 """Largest spacing of fitted samples, as a fraction of the survey's extent."""
-GAUSS_NEWTON_STEPS, SEARCH_EFFORT, CLIMB_STEPS = 4, 0.3, 14
+GAUSS_NEWTON_STEPS, SEARCH_EFFORT, CLIMB_STEPS, CORRECTIONS = 4, 0.3, 14, 2
 SEPARABLE_FRACTION = 0.5
 """Largest posterior over prior 1-sigma of lag and of lever arm with which the two count as separable."""
 SPEED_QUANTILES = 0.05, 0.95
@@ -197,6 +198,7 @@ class _JointFit:
         # Derivatives of the place by lag, forward and starboard lever arm.
         self.directions = np.stack([-rows.velocity, forward, starboard])
         self.chosen = _fitted_rows(rows.samples, FITTED_SAMPLES)
+        self.lacking = np.zeros(len(rows.raw))
         few = _fitted_rows(rows.samples, SCANNED_SAMPLES)
         # The likelihood has several maxima along the shift: a field first, then a scan, then Gauss-Newton.
         choice = self._search(few)
@@ -207,7 +209,12 @@ class _JointFit:
         self.choice = replace(choice, field=replace(choice.field, nodes=nodes))
         self._gauss_newton()
         # The noise is smaller at the right shift: choose field and noise again, on finer nodes.
-        self.choice = self._refine_field(self.choice)
+        choice = self.choice
+        self.choice = self._refine_field(choice)
+        if self.choice.rho:  # an error of the shift looks like correlated noise: reduce it with white noise
+            self.choice = self._refine_field(choice, white=True)
+            self._gauss_newton()
+            self.choice = self._refine_field(choice)
         self.solution = self._gauss_newton()
         # The field of the vehicle's iron, which turns with the heading, passes for a large shift.
         size = np.abs(self.shift[self.free])
@@ -239,7 +246,9 @@ class _JointFit:
 
     def _problem(self, chosen: IndexArray, shift: FloatArray, blocks: tuple[ParameterBlock, ...]) -> Rows:
         samples = replace(self.rows.samples, place=self.place(shift)).part(chosen)
-        return Rows(samples, blocks, Roughness.uniform())
+        problem = Rows(samples, blocks, Roughness.uniform())
+        problem.lacking = self.lacking[chosen]
+        return problem
 
     def _weighed(self, blocks: tuple[ParameterBlock, ...], length: float) -> Weighed:
         family = with_blocks(NO_COEFFICIENTS, blocks)
@@ -256,7 +265,7 @@ class _JointFit:
         change = max(robust_scale(np.diff(problem.samples.value)) / 2.0**0.5, FINE_NOISE_NT)
         return choose(
             lambda field: problem.sums(field, every), place, weighed, size / change,
-            harmonic=bool(np.ptp(problem.deeper) > 5.0), effort=SEARCH_EFFORT, most=SCANNED_NODES,
+            deeper=problem.deeper, effort=SEARCH_EFFORT, most=SCANNED_NODES,
         )  # fmt: skip
 
     def _scan(self, chosen: IndexArray, choice: Choice) -> Choice:
@@ -286,8 +295,8 @@ class _JointFit:
         sums = self._problem(chosen, self.shift, blocks).sums(choice.field, every)
         return climb(sums, choice, weighed, steps=CLIMB_STEPS)
 
-    def _refine_field(self, choice: Choice) -> Choice:
-        """Return the field and noise on finer nodes, with white or correlated noise as is likelier."""
+    def _refine_field(self, choice: Choice, *, white: bool = False) -> Choice:
+        """Return the field and noise on finer nodes, with `white` noise or what is likelier."""
         blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
         problem = self._problem(self.chosen, self.shift, blocks)
         field = choice.field
@@ -297,14 +306,26 @@ class _JointFit:
         nodes = nodes_for(problem.samples.place, field.length, field.alpha, FITTED_NODES, FINER_NODES)
         # Finer nodes resolve parts of the field that counted as noise in the scan.
         field = replace(field, nodes=nodes)
-        weighed, sums = self._weighed(blocks, field.length), problem.sums(field, every)
-        start = replace(choice, field=field)
+        weighed, start = self._weighed(blocks, field.length), replace(choice, field=field)
         # White noise has the amplitude of the innovations; the correlated noise is larger.
         ratio = choice.ratio / np.sqrt(1.0 - choice.rho**2)
-        white = climb(sums, replace(start, rho=0.0, ratio=ratio), weighed, move_rho=False, steps=CLIMB_STEPS)
-        if choice.rho == 0.0:
-            return white
-        return max(white, climb(sums, start, weighed, steps=CLIMB_STEPS), key=lambda found: found.score)
+        # What the basis lacks of the field depends on the nodes.
+        prior = weighed.sigma**2 * weighed.family.prior(weighed.eta).precision
+        for _ in range(CORRECTIONS if field.harmonic else 0):
+            reduced = eliminate_field(problem.sums(field, every), field, ratio, 0.0)
+            z = np.asarray(np.linalg.solve(reduced.quadratic.precision + prior, reduced.quadratic.vector))
+            problem.correct(field, reduced.field(z))
+        self.lacking[self.chosen] = problem.lacking
+        sums = problem.sums(field, every)
+        best = climb(sums, replace(start, rho=0.0, ratio=ratio), weighed, move_rho=False, steps=CLIMB_STEPS)
+        lengths = field.length, best.field.length
+        was, now = (too_coarse(nodes, length, field.alpha, FINER_NODES) for length in lengths)
+        if now and not was:
+            ratio = best.ratio * np.sqrt(1.0 - choice.rho**2)
+            return self._refine_field(replace(choice, field=best.field, ratio=ratio), white=white)
+        if white or choice.rho == 0.0:
+            return best
+        return max(best, climb(sums, start, weighed, steps=CLIMB_STEPS), key=lambda found: found.score)
 
     def _gauss_newton(self) -> _Solution:
         """Refine the shift together with all other terms by Gauss-Newton steps; return the last solution."""
@@ -336,6 +357,8 @@ class _JointFit:
             )
             # Back-substitution: the field given the dense unknowns.
             w = reduced.field(z)
+            problem.correct(self.choice.field, w)
+            self.lacking[self.chosen] = problem.lacking
             if moved:
                 self.shift[self.free] += z[-moved:]
             # Levels and slow changes come first in z; the report needs the rest.

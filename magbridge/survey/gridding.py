@@ -147,6 +147,8 @@ class Gridded:
             here, variance = one.evaluate(csr_array(diags_array(scale) @ one.field.basis(place, deeper)))
             # Beyond the nodes the prior is all that is known.
             variance[outside] = (one.size * scale[outside]) ** 2
+            if depth is not None:
+                here = here + scale * one.field.lacking(place, np.broadcast_to(deeper, len(place)), one.w)
             here = here - one.mean
             mean += one.weight * here
             square += one.weight * (variance + here**2)
@@ -181,7 +183,8 @@ class Gridded:
             ]
             return np.asarray(self.mean + sum(parts))
 
-        return in_chunks(len(rough), evaluate_rows)
+        lacking = [one.weight * one.field.lacking(samples.place, deeper, one.w) for one in self.posteriors]
+        return np.asarray(in_chunks(len(rough), evaluate_rows) + rough * np.sum(lacking, axis=0))
 
 
 LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
@@ -228,15 +231,19 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
     groups = _needed(problem.groups, sums, choice, sigma)
     family = with_blocks(NO_COEFFICIENTS, groups)
     weighed = Weighed(family, family.centre, sigma, choice.field.length)
-    # 4. Fit, leave out the outliers, and fit again.
-    for turn in range(2):
+    # 4. Fit, leave out the outliers, subtract what the basis lacks of the fitted field, and fit again.
+    deep = choice.field.harmonic and bool(problem.deeper.any())
+    turns = 3 if deep else 2
+    for turn in range(turns):
         reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
         widths = maximise_evidence(reduced.quadratic, family, weighed.eta, sigma)
         z, _ = _solved(reduced, widths, family)
         w = reduced.field(z)
+        problem.correct(choice.field, w)
         e = samples.value - problem.mean - problem.D @ z - problem.rock(choice.field, w)
         e = e / problem.scale  # unresolved anomalies grow with the roughness of the crustal field
-        if turn or not (far := np.abs(e) > GRID_OUTLIER_SIGMA * max(robust_scale(e), widths.sigma)).any():
+        far = np.abs(e) > GRID_OUTLIER_SIGMA * max(robust_scale(e), widths.sigma)
+        if turn == turns - 1 or not (deep or far.any()):
             break
         problem.kept = ~far
         sums = problem.sums(choice.field, every)
@@ -304,7 +311,7 @@ def _posterior(
     return Posterior(
         weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, follow,
         reduced.precision, inverse_blocks(reduced.precision, choice.field.edges(reduced.precision)),
-        levels - levels[problem.kept].mean(), float(mean @ w),
+        levels - levels[problem.kept].mean(), float(mean @ w + problem.lacking[problem.kept].mean()),
     )  # fmt: skip
 
 
@@ -367,7 +374,7 @@ def _searched(
     else:
         best = choose(
             lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
-            harmonic=bool(np.ptp(problem.deeper) > 5.0), effort=0.5, most=SEARCHED_NODES,
+            deeper=problem.deeper, effort=0.5, most=SEARCHED_NODES,
             rho=None if samples.rho is None else samples.rho**step,
         )  # fmt: skip
         rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho

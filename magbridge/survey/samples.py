@@ -162,6 +162,8 @@ class Rows:
         self.middle = float(np.nanmedian(samples.depth))
         self.deeper = np.nan_to_num(samples.depth - self.middle)
         self.D = BlockColumns(groups)
+        self.lacking = np.zeros(len(samples.value))
+        """What :meth:`basis` lacks of the field at each sample (n,), nT."""
         self.scale = roughness.evaluate(samples.place)
         self.kept = np.ones(len(samples.value), bool)
         # Noise is correlated between neighbours on one line only, and not across a gap.
@@ -183,9 +185,13 @@ class Rows:
             total += self.basis(field, kept[start : start + BLOCK_ROWS]).sum(axis=0)
         return total / len(kept)
 
+    def correct(self, field: GaussianField, w: FloatArray) -> None:
+        """Compute what :meth:`basis` lacks of the field of coefficients w (nodes,)."""
+        self.lacking = self.scale * field.lacking(self.samples.place, self.deeper, w)
+
     def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
         """Return the crustal field (n,), nT, at every sample, given its coefficients w (nodes,)."""
-        return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
+        return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w) + self.lacking
 
     def sums(self, field: GaussianField, rows: IndexArray, modes: bool = False) -> SampleSums:
         """Return the sums of the model's rows over the kept ones of the samples `rows` (m,).
@@ -204,7 +210,7 @@ class Rows:
             first = max(start - 1, 0)
             mine = rows[first : start + BLOCK_ROWS]
             weight = -1.0 / s.weight[mine]
-            V = [(s.value[mine] - self.mean)[:, None], self.D[mine]]
+            V = [(s.value[mine] - self.mean - self.lacking[mine])[:, None], self.D[mine]]
             if modes:
                 V.append(s.modes[mine])
             rows_of = np.concatenate(V, axis=1)

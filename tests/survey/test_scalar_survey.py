@@ -43,11 +43,18 @@ def rock(random: np.random.Generator, depth: float) -> tuple[FloatArray, FloatAr
 
 
 def grid(
-    seed: int = 1, depth: float = 150.0, side: float = SIDE_M, *, level: float = 3.0, error: float = 2.0
+    seed: int = 1,
+    depth: float = 150.0,
+    side: float = SIDE_M,
+    *,
+    level: float = 3.0,
+    error: float = 2.0,
+    rise: float = 0.0,
 ) -> Grid:
     """Return lines 100 m and ties 500 m from each other, flown to and fro, with a level for each line.
 
-    `level` is the standard deviation of the lines' levels, and `error` the heading error's amplitude, nT.
+    `level` is the standard deviation of the lines' levels, and `error` the heading error's amplitude, nT. The
+    height is within `rise` m of 80 m.
     """
     random = np.random.default_rng(seed)
     waves, phases = rock(random, depth)
@@ -72,16 +79,18 @@ def grid(
     forward, starboard = LEVER_M
     arm = [forward * np.cos(psi) - starboard * np.sin(psi), forward * np.sin(psi) + starboard * np.cos(psi)]
     sensor = position - LAG_S * velocity + np.stack(arm, axis=1)
-    truth = 50.0 * np.sqrt(2 / len(waves)) * np.cos(sensor @ waves.T + phases).sum(axis=1)
+    deeper = rise * np.sin(np.arange(len(psi)) / 6.0)
+    growth = np.exp(deeper[:, None] * np.linalg.norm(waves, axis=1))
+    truth = 50.0 * np.sqrt(2 / len(waves)) * (growth * np.cos(sensor @ waves.T + phases)).sum(axis=1)
     latitude, longitude = offset(*ORIGIN, position[:, 0], position[:, 1])
     clocks = np.concatenate(time)
-    reading = magnitude(igrf(longitude, latitude, np.full(len(clocks), -80.0), clocks)) + truth
+    reading = magnitude(igrf(longitude, latitude, deeper - 80.0, clocks)) + truth
     reading += error * np.cos(psi - 0.7) + random.normal(0, level, len(starts))[label]
     reading += random.normal(0, NOISE_NT, len(clocks))
     columns = {
         "latitude": (latitude, "deg"),
         "longitude": (longitude, "deg"),
-        "depth": (np.full(len(psi), -80.0), "m"),
+        "depth": (deeper - 80.0, "m"),
         "heading": (np.degrees(psi) % 360.0, "deg"),
         "line": (label.astype(float), "1"),
         SENSOR: (reading, "nT"),
@@ -121,6 +130,15 @@ def test_shift_and_heading_error_are_found(flown: Grid) -> None:
     assert set(found.scalar.contribution) == {"heading error", "lag and lever arm"}
     # Levels of 3 nT on 14 lines hide a heading error of 2 nT.
     assert {finding.code for finding in found.scalar.findings} == {"scalar.shift"}
+
+
+def test_shift_has_its_sigma_where_the_height_varies() -> None:
+    """By 4.8 m, which changes the field by 15 times the noise."""
+    found = mb.survey([grid(side=500.0, rise=2.4).log], scalar=SENSOR)
+    assert found.scalar is not None
+    assert abs(found.scalar.along_m - (LEVER_M[0] - SPEED_M_S * LAG_S)) < 3.0 * found.scalar.along_sigma_m
+    assert abs(found.scalar.shift[2] - LEVER_M[1]) < 3.0 * found.scalar.shift_sigma[2]
+    assert found.gridded.sigma == pytest.approx(NOISE_NT, rel=0.2)
 
 
 def test_a_shift_that_no_sensor_has_is_a_warning_with_a_wide_sigma(flown: Grid) -> None:

@@ -165,7 +165,7 @@ def choose(
     weighed: Weighed,
     start: float,
     *,
-    harmonic: bool,
+    deeper: FloatArray,
     rho: float | None = None,
     effort: float = 1.0,
     most: int = MAX_FIELD_NODES,
@@ -173,10 +173,14 @@ def choose(
     """Return the field and noise of the largest evidence, without an initial field.
 
     `sums_of`: function that returns the normal equations of the samples for a field. `place` (n, 2): m.
-    `start`: initial ratio of field and noise. `harmonic`: True if the depth varies, so that the search also
-    tries a field that decreases upwards. `rho`: autocorrelation of the noise, if known. `effort`: fraction of
-    the usual number of steps. `most`: largest number of nodes.
+    `start`: initial ratio of field and noise. `deeper` (n,): depth of the samples, m; if it matters, the
+    search also tries a field that decreases upwards. `rho`: autocorrelation of the noise, if known. `effort`:
+    fraction of the usual number of steps. `most`: largest number of nodes.
     """
+    # A field of size s and length l changes with depth by about s / l. Over all samples these changes, in
+    # units of the noise, have the norm (s / sigma) |deeper| / l, and change the log likelihood by half its
+    # square: below 1 they do not matter.
+    harmonic = bool(start * np.linalg.norm(deeper - deeper.mean()) > ladder(place)[0])
     # 1. correlation length at the usual smoothness; 2. decrease upwards; 3. smoothness; 4. sources at a
     # depth. Each step starts from the best field so far, and maximises the evidence over amplitude,
     # autocorrelation of the noise and length.

@@ -133,7 +133,6 @@ class Rounds:
         # a part about the middle shows size and length of the field as well as all samples do
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
-        self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
         self.middle = float(np.median(ladder(survey.place[self.part])))
         self.choice = self._everywhere(first_guess(survey.place[self.part]))
         # begin near the solution, with the crustal field as noise: the start with the smaller residuals
@@ -225,7 +224,7 @@ class Rounds:
         place, before = self.survey.place[self.part], self.choice
         # first over a ladder of lengths, later from the last choice
         if anew:
-            found = choose(self._few, place, weighed, before.ratio, harmonic=self.harmonic)
+            found = choose(self._few, place, weighed, before.ratio, deeper=self.survey.deeper[self.part])
         else:
             begin = replace(before, rho=before.rho**self.step)
             if not self.part.all():
