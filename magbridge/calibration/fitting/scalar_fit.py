@@ -66,8 +66,8 @@ CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA = 10.0, 1.5
 """nT a swing and its log's 1-sigma: centre of a channel's width."""
 LAG = PLATFORM_TERMS - 1
 """Column of the lag."""
-LAG_GRID_S, LEAST_LAG_GAIN = np.linspace(-1.5, 1.5, 61), 20.0
-"""Lags that are tried first, s, and twice the log likelihood by which one must be better than no lag."""
+LAG_GRID_S = np.linspace(-1.5, 1.5, 61)
+"""Lags that are tried first, s."""
 LAG_SIGMA_S = 0.5
 """1-sigma of the lag between scalar and vector, s."""
 TIME_CONSTANTS_S = (1.5, 5.0, 15.0, 50.0, 150.0, 500.0, 1500.0, 5000.0)
@@ -252,8 +252,9 @@ def _first_lag(
     -----
     Changes over the fit's interval have little slow noise and crustal field, so that least squares suffices.
     With an orthonormal basis Q of the changes of the columns, the sum of squares that a lag leaves of the
-    changes y of the moved reading minus reference is ``y^T y - |Q^T y|^2``. A lag of which the samples show
-    nothing is 0.
+    changes y of the moved reading minus reference is ``y^T y - |Q^T y|^2``. Its log is half the number of
+    intervals times the log likelihood. The prior alone decides for 0 where the samples show nothing: with a
+    threshold, a lag below it was left to the linear column, which finds half of it.
     """
     design = scalar_design(series, channels, reference_field)
     design[:, LAG] = 0.0
@@ -273,11 +274,10 @@ def _first_lag(
     Q = np.linalg.svd(columns[:, np.ptp(columns, axis=0) > 0.0], full_matrices=False)[0]
     left = ((tried[:, rows] - (tried[:, rows] @ Q) @ Q.T) ** 2).sum(axis=1)
     if lag is None:
-        best, zero = int(left.argmin()), int(np.abs(lags).argmin())
-        gain = rows.sum() / many * np.log(left[zero] / left[best])
-        lag = 0.0
-        if gain > LEAST_LAG_GAIN and 0 < best < len(lags) - 1:
-            below, at, above = left[best - 1 : best + 2]
+        cost = rows.sum() / many * np.log(left) + (lags / LAG_SIGMA_S) ** 2
+        best, lag = int(cost.argmin()), 0.0
+        if 0 < best < len(lags) - 1:
+            below, at, above = cost[best - 1 : best + 2]
             lag = float(lags[best] + 0.5 * (lags[1] - lags[0]) * (below - above) / (below - 2.0 * at + above))
     found = np.linalg.lstsq(columns, changes(lag)[rows], rcond=1e-6)[0]
     return lag, np.asarray(found)
