@@ -26,6 +26,10 @@ USUAL_AMPLITUDE_DEG = (10.0, 5.0, 5.0)
 """Amplitude of the rolls, pitches and yaws of a box, deg."""
 MIN_AMPLITUDE_FRACTION = 0.35
 """Fraction of the usual amplitude from which on an oscillation is a manoeuvre."""
+MAX_OTHER_AXES = 0.4
+"""Amplitude of the other axes in units of that of the manoeuvre's axis, each relative to the usual one: gusts
+move all axes. Of 80 simulated logs with gusts of 1.5 to 4 deg RMS one counts as a box (at 0.3 none, at 0.5
+three), and of boxes with gusts of 1 deg and rolls that yaw, all do (at 0.3, three in four)."""
 WINDOW_S, MIN_DURATION_S = 6.0, 8.0
 """Window of an oscillation's amplitude, and duration of the shortest manoeuvre, s."""
 MIN_RATE_HZ = 1.5
@@ -89,10 +93,18 @@ def box_flight(
     found = [
         Manoeuvre(MANOEUVRE_AXES[axis[begin]], float(turned[begin:end].mean() % 360.0), slice(begin, end))
         for begin, end in pairwise(edges)
-        if axis[begin] >= 0 and time[end - 1] - time[begin] >= MIN_DURATION_S
+        if axis[begin] >= 0
+        and time[end - 1] - time[begin] >= MIN_DURATION_S
+        and _is_of_one_axis(relative[begin:end], int(axis[begin]))
     ]
     best = _one_for_each_heading(found)
     return BoxFlight(best, interval) if len(best) >= MIN_MANOEUVRES else None
+
+
+def _is_of_one_axis(relative: FloatArray, axis: int) -> bool:
+    """Return True if the other axes swing far less than `axis`; `relative` (n, 3): amplitudes."""
+    others = np.delete(relative, axis, axis=1).max(axis=1)
+    return bool(np.median(others / relative[:, axis]) < MAX_OTHER_AXES)
 
 
 def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:

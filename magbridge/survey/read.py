@@ -436,9 +436,12 @@ def _log_rows(
         heading = np.where(np.isfinite(own), own, heading)
     boxes = _boxes(log, samples.time, heading, raw, value, terms)
     # Manoeuvres of a box are not fitted: they test the result.
+    left_out: tuple[Diagnostic, ...] = ()
     for box_rows in boxes:
-        known &= ~box_rows.box.rows(len(known))
-    samples = replace(samples, rho=None).part(known)
+        inside = box_rows.box.rows(len(known))
+        values = {"count": int((known & inside).sum()), "samples": len(known)}
+        left_out, known = (Diagnostic("box_samples", values),), known & ~inside
+    samples = replace(samples, rho=None, left_out=left_out).part(known)
     used = tuple(AlignmentTerm(name, columns[known]) for name, columns in terms)
     return ScalarRows(column, samples, raw[known], heading[known], velocity[known], used, compensated, boxes)
 

@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 from commands import Command
 from gliders import Gliders
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from magbridge import logs
@@ -134,6 +135,21 @@ def test_a_flight_without_manoeuvres_and_a_slow_log_do_not_count_as_a_box() -> N
     time, angles, _ = box()
     assert box_flight(time, 0.1 * angles[:, 0], 0.1 * angles[:, 1], np.full(len(time), 20.0)) is None
     assert box_flight(time[::10], *angles[::10].T) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gusts_on_lines_of_four_headings_are_not_a_box(seed: int) -> None:
+    """3 deg RMS of random attitude on every axis, with correlation times of the manoeuvres' periods."""
+    time = np.arange(int(4 * 240.0 * RATE)) / RATE
+    noise = np.random.default_rng(seed).normal(size=(len(time), 3))
+    gust = gaussian_filter1d(noise, 0.8 * RATE, axis=0)
+    gust *= 3.0 / gust.std(axis=0)
+    gust[:, 2] += 90.0 * (time // 240.0)
+    assert box_flight(time, *gust.T) is None
+    flown, angles, _ = box()
+    found = box_flight(flown, *(angles + 0.3 * gust[: len(angles)] * [1.0, 1.0, 0.0]).T)
+    assert found is not None
+    assert len(found.manoeuvres) >= 10
 
 
 def test_a_box_that_was_not_fitted_is_within_0_05_nt_of_a_fit_to_it() -> None:

@@ -242,6 +242,7 @@ def test_the_page_runs_from_the_files_to_the_map(
     assert {"permanent", "motor_current"} <= set(found.scalar.facts()["contribution_nT"])
     merit = found.scalar.facts()["figure_of_merit"]
     assert merit["after_nT"] < 0.5 * merit["before_nT"]
+    assert any(warning.code == "box_samples" for warning in found.warnings)
     lines_only = found.samples.time >= flown.log["time"].to_numpy()[0]
     error = (found.samples.value - found.gridded.levels)[lines_only] - flown.truth
     assert np.std(error) < 0.3
