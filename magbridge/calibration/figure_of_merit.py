@@ -128,10 +128,13 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
 def figure_of_merit(box: BoxFlight, measured: FloatArray, compensated: FloatArray) -> dict[str, Any]:
     """Return figure of merit and improvement ratio as plain values, with those of each manoeuvre.
 
-    `measured`, `compensated` (n,): field before and after compensation, nT; NaN where unknown.
+    `measured`, `compensated` (n,): field before and after compensation, nT; NaN where unknown. A sample that
+    is unknown in one of them is not used in the other.
     """
+    unknown = np.isnan(measured) | np.isnan(compensated)
     # Peak to peak of each manoeuvre in the band; their sum is the figure of merit.
-    seen = [_band(_filled(values), box.interval) for values in (measured, compensated)]
+    both = (np.where(unknown, np.nan, values) for values in (measured, compensated))
+    seen = [_band(_filled(values), box.interval) for values in both]
     table: list[dict[str, Any]] = [
         {
             "axis": one.axis,

@@ -119,9 +119,13 @@ def calibrate_scalar(
 
 
 def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
-    """Return a scalar magnetometer's reading (n,), nT, NaN for 0; DataError: no total field in nT."""
+    """Return a scalar magnetometer's reading (n,), nT, NaN for 0, from its declared unit.
+
+    DataError: it is no total field.
+    """
     reading = ds[column].to_numpy().astype(float)
-    reading = np.where(reading == 0.0, np.nan, reading)
+    unit = usual(str(ds[column].attrs.get("units", "")))
+    reading = np.where(reading == 0.0, np.nan, reading * NT_PER_UNIT.get(unit, 1.0))
     median = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
     if not 1e4 < median < 1e5:
         source = ds.attrs.get("source", "the log")
