@@ -377,7 +377,7 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
     FormatError, DataError: the base station's log has no field, or does not cover the time of the logs.
     WrongUse: there are logs of several observatories.
     """
-    from magbridge.field.reference import separate_observatories, with_daily_variation
+    from magbridge.field.reference import separate_observatories, station_gaps, with_daily_variation
     from magbridge.logs.deployment import join
 
     own, stations = separate_observatories(logs)
@@ -390,7 +390,9 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
         raise WrongUse(f"{names}: expected logs of one observatory, got several; give that of the nearest")
     station = join(stations)
     note_losses(station.attrs)
-    return with_daily_variation(own, station)
+    found = with_daily_variation(own, station)
+    complain_all(station_gaps(found, str(station.attrs["source"])))
+    return found
 
 
 def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: Any) -> tuple[str, ...]:

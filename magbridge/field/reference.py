@@ -14,6 +14,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import CHANNELS, counts_from_boot
 from magbridge.datasets import in_standard_units
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import DataError, FormatError, OutOfRange
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "missing_anomaly", "other_units",
     "placed", "positions", "reference_field", "require_date", "separate_observatories", "sphere_radius",
-    "variation_level_sigma", "with_daily_variation", "with_true_heading",
+    "station_gaps", "variation_level_sigma", "with_daily_variation", "with_true_heading",
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
@@ -281,8 +282,8 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
     return out
 
 
-MAX_EXTRAPOLATION_S = 600.0
-"""Longest time beyond the ends of a station's log for which its end value holds, s."""
+MAX_STATION_GAP = 3.0, 60.0
+"""Longest time between two samples of a station, or beyond its ends, in intervals and at least in s."""
 DAY_S, DAILY_RANGE_NT = 86_400.0, 45.0
 """Length of a day, s, and usual range of the quiet daily variation, nT: the geometric mean of 20 and 100."""
 
@@ -297,8 +298,8 @@ def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[x
     """Return the vehicle's logs with the variation of a base station's field as ``daily_variation``, nT.
 
     `base` has ``total_field`` (nT), ``reference_field`` or a raw vector. The variation is about its median,
-    and its attribute ``level_sigma`` is the 1-sigma of this level, nT. FormatError: `base` has none of
-    them. DataError: `base` does not cover the logs' time.
+    and its attribute ``level_sigma`` is the 1-sigma of this level, nT. It is NaN where `base` has no sample
+    near. FormatError: `base` has none of them. DataError: `base` covers no time of a log.
     """
     total = _total(base)
     known = np.isfinite(total)
@@ -308,11 +309,36 @@ def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[x
     found = []
     for log in logs:
         t = log["time"].to_numpy()
-        if not len(time) or t[0] < time[0] - MAX_EXTRAPOLATION_S or t[-1] > time[-1] + MAX_EXTRAPOLATION_S:
+        covered = _covered(t, time)
+        if not covered.any():
             source = base.attrs.get("source", "the base station's log")
             raise DataError(f"{source}: does not cover the time of {log.attrs.get('source', 'the log')}")
-        found.append(log.assign(daily_variation=("time", np.interp(t, time, varied), described)))
+        variation = np.where(covered, np.interp(t, time, varied), np.nan)
+        found.append(log.assign(daily_variation=("time", variation, described)))
     return found
+
+
+def station_gaps(logs: Sequence[xr.Dataset], source: str) -> tuple[Diagnostic, ...]:
+    """Return a warning if the base station `source` does not cover all of the logs' time, else ()."""
+    spans: list[float] = []
+    for log in logs:
+        time, rows = log["time"].to_numpy(), np.flatnonzero(np.isnan(log["daily_variation"].to_numpy()))
+        runs = [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]
+        spans += [float(time[min(run[-1] + 1, len(time) - 1)] - time[run[0]]) for run in runs]
+    if not spans:
+        return ()
+    values = {"source": source, "seconds": sum(spans), "longest_s": max(spans)}
+    return (Diagnostic("base_station_gap", values),)
+
+
+def _covered(t: FloatArray, time: FloatArray) -> BoolArray:
+    """Return True for times (n,) with samples of a station, at `time` (m,), near on both sides, s."""
+    if len(time) < 2:
+        return np.zeros(len(t), bool)
+    most = max(MAX_STATION_GAP[0] * float(np.median(np.diff(time))), MAX_STATION_GAP[1])
+    after = np.searchsorted(time, t).clip(1, len(time) - 1)
+    inside = (time[after] - time[after - 1] <= most) | (t == time[after])
+    return np.asarray(inside & (t >= time[0] - most) & (t <= time[-1] + most))
 
 
 def _level_sigma(time: FloatArray, variation: FloatArray) -> float:

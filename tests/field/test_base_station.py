@@ -76,6 +76,28 @@ def test_a_station_of_another_day(storm: Path) -> None:
         with_daily_variation([log.assign_coords(time=log["time"] + 86_400.0)], station)
 
 
+def test_samples_that_a_station_does_not_cover_are_left_out_with_one_warning(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The station has a hole of 300 s, and ends 305 s before the log; a gap of 30 s is interpolated."""
+    time = START + np.arange(0.0, 1800.0, 5.0)
+    at = np.arange(START, START + 1500.0)
+    hole = (at > START + 600.0) & (at < START + 900.0)
+    short = (at > START + 1200.0) & (at < START + 1230.0)
+    base = deployment("base", at[~hole & ~short], {"total_field": 50_000.0 + varied(at[~hole & ~short])})
+    write(base, here / "base.csv")
+    (found,) = by_base_station([deployment("log", time, {"mag_x": 0.0 * time})], Path("base.csv"))
+    variation = found["daily_variation"].to_numpy()
+    since = time - START
+    unknown = ((since > 600.0) & (since < 900.0)) | (since > 1559.0)
+    np.testing.assert_array_equal(np.isnan(variation), unknown)
+    error = (variation - varied(time))[~unknown & (since < 1500.0)]
+    assert np.ptp(error) < 0.1
+    said = [line for line in capsys.readouterr().err.splitlines() if "does not cover" in line]
+    assert len(said) == 1
+    assert "530 s of the logs (295 s in one piece)" in said[0]
+
+
 @pytest.mark.parametrize("hours", [2.0, 6.0, 12.0])
 def test_the_level_of_a_base_station_is_uncertain(hours: float) -> None:
     """The true level is that of all days: of a daily variation and a faster one, of random phases."""
