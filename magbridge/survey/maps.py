@@ -6,11 +6,13 @@ import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
+from numpy.typing import NDArray
 
-from magbridge.arrays import FloatArray, IndexArray
+from magbridge.arrays import FloatArray
 from magbridge.field.continuation import continued, raised
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
@@ -119,15 +121,17 @@ def write_geotiff(grid: AnomalyGrid, path: Path) -> None:
 
 def write_tracks(samples: Samples, path: Path) -> None:
     """Write every line's track, as GeoJSON or, where the suffix is .kml, as KML."""
-    tracks = {f"{label}": _track(samples, label) for label in np.unique(samples.line).tolist()}
+    names = samples.names()
+    tracks = {label: _track(samples, label) for label in np.unique(samples.line).tolist()}
     with atomic_path(path) as temporary:
         if path.suffix.lower() == ".kml":
-            temporary.write_text(_kml(tracks), encoding="utf-8")
+            named = [(names[label], track) for label, track in tracks.items()]
+            temporary.write_text(_kml(named), encoding="utf-8")
             return
         features = [
             {
                 "type": "Feature",
-                "properties": {"line": label, "tie": bool(samples.tie[samples.line == int(label)].any())},
+                "properties": {"line": names[label], "tie": bool(samples.tie[samples.line == label].any())},
                 "geometry": {"type": "LineString", "coordinates": track.round(7).tolist()},
             }
             for label, track in tracks.items()
@@ -141,9 +145,10 @@ def write_crossovers(
 ) -> None:
     """Write a row for each crossover: place, lines, and its mis-ties (m,), nT, before and after."""
     latitude, longitude = offset(*samples.origin, found.place[:, 0], found.place[:, 1])
-    lines: list[IndexArray] = [samples.line[found.first], samples.line[found.second]]
+    names = np.array(samples.names())
+    lines = [names[samples.line[rows]] for rows in (found.first, found.second)]
     heads = ["longitude", "latitude", "line", "crossed", "before [nT]", "after [nT]"]
-    columns: list[FloatArray | IndexArray] = [longitude.round(7), latitude.round(7), *lines]
+    columns: list[NDArray[Any]] = [longitude.round(7), latitude.round(7), *lines]
     columns += [old_misties.round(3), new_misties.round(3)]
     _write_csv(path, heads, columns)
 
@@ -156,7 +161,7 @@ def write_points(
     _write_csv(path, heads, [longitude, latitude, anomaly.round(3), sigma.round(3)])
 
 
-def _write_csv(path: Path, heads: list[str], columns: Sequence[FloatArray | IndexArray]) -> None:
+def _write_csv(path: Path, heads: list[str], columns: Sequence[NDArray[Any]]) -> None:
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(heads)
@@ -171,12 +176,12 @@ def _track(samples: Samples, label: int) -> FloatArray:
     return np.stack([longitude, latitude], axis=1)
 
 
-def _kml(tracks: dict[str, FloatArray]) -> str:
+def _kml(tracks: Sequence[tuple[str, FloatArray]]) -> str:
     marks = "\n".join(
         f"<Placemark><name>line {escape(label)}</name><LineString><coordinates>"
         + " ".join(f"{x:.7f},{y:.7f}" for x, y in track.tolist())
         + "</coordinates></LineString></Placemark>"
-        for label, track in tracks.items()
+        for label, track in tracks
     )
     header = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
     return f"{header}\n{marks}\n</Document></kml>\n"

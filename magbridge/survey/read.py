@@ -9,11 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import hypot
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from magbridge.arrays import BoolArray, FloatArray
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.figure_of_merit import BoxFlight, box_flight
 from magbridge.calibration.fitting.observe import at_one_time
@@ -83,9 +84,9 @@ def read_table(path: Path) -> Samples:
     longitude, latitude, depth = _places(path, table)
     depth = np.zeros(len(value)) if depth is None else depth
     lines = next((name for name in ("line", "line_number", "line_no") if name in table), None)
-    line = np.zeros(len(value), int)
+    line, line_names = _labels(np.zeros(len(value), int))
     if lines:  # an empty cell is a line of its own
-        line = np.unique(table[lines].astype(str).fillna(""), return_inverse=True)[1]
+        line, line_names = _labels(table[lines].astype(str).fillna("").to_numpy(str))
     kind = table["line_type"].astype(str).str.upper() if "line_type" in table else None
     tie = np.zeros(len(value), bool) if kind is None else kind.isin(TIE).to_numpy()
     known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)
@@ -96,7 +97,7 @@ def read_table(path: Path) -> Samples:
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     place = np.stack(separation(*origin, latitude, longitude), axis=1)
     no_time = np.full(len(value), np.nan)
-    return Samples(place, depth, no_time, value, line.ravel(), tie, origin).part(known)
+    return Samples(place, depth, no_time, value, line, tie, origin, line_names=line_names).part(known)
 
 
 def read_points(
@@ -170,15 +171,25 @@ def located(ds: xr.Dataset, value: FloatArray, name: str = "a field") -> tuple[S
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     place = np.stack(separation(*origin, latitude, longitude), axis=1)
     line, tie = np.zeros(len(value), int), np.zeros(len(value), bool)
+    line_names: tuple[str, ...] = ()
     if "line" in ds:
         names = ds["line"].to_numpy()
         names = names.astype(str) if names.dtype.kind == "O" else names
-        line = np.unique(names, return_inverse=True)[1].ravel()
+        line, line_names = _labels(names)
         if "line_type" in ds:
             tie = np.isin(np.char.upper(ds["line_type"].to_numpy().astype(str)), TIE)
     time = np.asarray(ds["time"].to_numpy(), float)
     level_sigma = variation_level_sigma(ds)
-    return Samples(place, depth, time, value, line, tie, origin, level_sigma=level_sigma), known
+    samples = Samples(
+        place, depth, time, value, line, tie, origin, level_sigma=level_sigma, line_names=line_names
+    )
+    return samples, known
+
+
+def _labels(names: NDArray[Any]) -> tuple[IndexArray, tuple[str, ...]]:
+    """Return the label (n,) of the line of each sample, and the text of each label's number or name."""
+    found, line = np.unique(names, return_inverse=True)
+    return line.ravel(), tuple(f"{one:g}" if isinstance(one, float) else str(one) for one in found.tolist())
 
 
 def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
@@ -193,11 +204,14 @@ def joined(parts: Sequence[Samples]) -> Samples:
     """Return the samples of several logs as one, about the first origin; lines and modes stay separate."""
     origin = parts[0].origin
     places, lines, first = [], [], 0
+    names: list[str] = []
     for one in parts:
         shift = separation(*origin, *one.origin)
         places.append(one.place + np.array(shift))
         lines.append(one.line + first)
-        first += int(one.line.max()) + 1
+        labels = int(one.line.max()) + 1
+        names += one.line_names[:labels] or map(str, range(first, first + labels))
+        first += labels
     many = sum(one.modes.shape[1] for one in parts)
     modes = np.zeros((sum(len(one.value) for one in parts), many))
     row = column = 0
@@ -214,7 +228,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     return Samples(
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
         max(rho) if len(rho) == len(parts) else None, modes, max(one.level_sigma for one in parts),
-        tuple(reason for one in parts for reason in one.left_out),
+        tuple(reason for one in parts for reason in one.left_out), tuple(names),
     )  # fmt: skip
 
 

@@ -53,6 +53,8 @@ class Samples:
     """1-sigma of the constant error of all samples (the reference bias), nT."""
     left_out: tuple[Diagnostic, ...] = ()
     """Why samples of the logs are not among these."""
+    line_names: tuple[str, ...] = ()
+    """Number or name of each label's line in the log; empty for the labels themselves."""
 
     def __post_init__(self) -> None:
         n = len(self.value)
@@ -60,6 +62,10 @@ class Samples:
             object.__setattr__(self, "weight", np.ones(n))
         if not len(self.modes):
             object.__setattr__(self, "modes", np.empty((n, 0)))
+
+    def names(self) -> tuple[str, ...]:
+        """Return the number or name of the line of every label, by which the log and people know it."""
+        return self.line_names or tuple(map(str, range(int(self.line.max(initial=-1)) + 1)))
 
     def part(self, rows: BoolArray | IndexArray) -> Samples:
         """Return the samples that `rows` selects, an (n,) mask or indices."""

@@ -1,5 +1,6 @@
 """Test a scalar magnetometer on lines and ties: lag, lever arm and heading error from the survey only."""
 
+import csv
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -162,11 +163,26 @@ def test_a_heading_error_is_named_where_the_levels_of_lines_do_not_hide_it(error
     assert found.scalar.heading_error[:2] == pytest.approx(error * np.array([0.76, 0.64]), abs=0.7)
 
 
+def in_microtesla(log: xr.Dataset) -> xr.DataArray:
+    """Return the scalar's reading in a declared unit other than nT."""
+    return (1e-3 * log[SENSOR]).assign_attrs(units="uT")
+
+
 def test_command_with_a_known_shift(flown: Grid, tmp_path: Path, command: Command) -> None:
     log, out = tmp_path / "grid.nc", tmp_path / "map.nc"
-    logs.write(flown.log, log)
+    lines = 10.0 * flown.log["line"] + 100.0
+    logs.write(flown.log.assign({"line": lines, SENSOR: in_microtesla(flown.log)}), log)
     given = "survey", log, "--scalar", SENSOR, "-o", out, "--lever", "1.5,-0.8,0", "--lag", "0.3"
-    facts = json.loads(command(*given, "--json").out)
+    crossings, tracks = tmp_path / "crossings.csv", tmp_path / "tracks.geojson"
+    facts = json.loads(command(*given, "--crossovers", crossings, "--tracks", tracks, "--json").out)
+    numbers = {f"{number:g}" for number in np.unique(lines).tolist()}
+    assert {
+        name
+        for row in csv.DictReader(crossings.read_text().splitlines())
+        for name in (row["line"], row["crossed"])
+    } == numbers
+    features = json.loads(tracks.read_text())["features"]
+    assert {feature["properties"]["line"] for feature in features} == numbers
     assert out.exists()
     assert facts["scalar"]["lag_s"] == {"value": 0.3, "sigma": 0.0}
     assert facts["misties_after_nT"] < 0.15
