@@ -58,7 +58,7 @@ class Track:
 
     __slots__ = (
         "before", "began_us", "first_us", "guess", "guess_us", "history", "input", "lacking", "last",
-        "last_us", "max_age", "moved_us", "rate", "recent",
+        "last_us", "max_age", "moved_us", "rate", "recent", "reported_before_us",
     )  # fmt: skip
 
     def __init__(self, quantity: Input) -> None:
@@ -66,6 +66,7 @@ class Track:
         self.history: deque[tuple[int, float]] = deque(maxlen=TRACK_LENGTH)
         self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
         self.first_us = NEVER
+        self.reported_before_us = NEVER  # time of the report before the last one
         # interval of times (µs) with values of unknown time, and interval of these values
         self.guess_us, self.guess = (NEVER, NEVER), (nan, nan)
         self.lacking = True
@@ -98,6 +99,7 @@ class Track:
         newest = time_us, value
         self.history.append(newest)
         self.first_us = self.history[0][0]
+        self.reported_before_us = self.history[-2][0] if len(self.history) > 1 else time_us
         recent, past_us = self.recent, time_us - MOTION_US
         recent.append(newest)
         while len(recent) > 1 and recent[1][0] <= past_us:
@@ -119,11 +121,6 @@ class Track:
     def stale(self, time_us: int) -> bool:
         """Return True if the value is unknown, or older than ``max_age``, at `time_us`."""
         return self.lacking or time_us - self.last_us > self.max_age * 1e6
-
-    @property
-    def reported_before_us(self) -> int:
-        """Time of the report before the last one, µs."""
-        return self.history[-2][0] if len(self.history) > 1 else self.last_us
 
     def extremes_since(self, begin_us: int) -> tuple[float, float]:
         """Return smallest and largest value since `begin_us` (µs), including the value at that time."""

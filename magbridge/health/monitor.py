@@ -21,6 +21,7 @@ MAX_AGE_S: Final = 60.0
 """Longest time for which a jump or a sample of the consistency test waits for newer telemetry, s."""
 
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
+STALE_TELEMETRY: Final = int(Quality.STALE_TELEMETRY)
 UNSTEADY: Final = int(Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 """Flags of a sample that the trend and consistency checks skip."""
 
@@ -136,8 +137,8 @@ class HealthMonitor:
                 trend.follow_telemetry(time_us, total)
             variance += trend.check(time_us, total, own_sigma, turned, learn=not doubtful)
         self.is_fault = doubtful or trend.is_outlier or time_us < level.until_us
-        reported_us = time_us - round(1e6 * min(age, MAX_AGE_S))
-        trend.confirm(time_us if quality & Quality.STALE_TELEMETRY else reported_us)
+        if trend.is_waiting:
+            trend.confirm(time_us if quality & STALE_TELEMETRY else _reported_us(time_us, age))
         variance += trend.jump_variance(time_us)
         if self.is_fault or trend.is_away:
             self.flags = IMPLAUSIBLE
@@ -152,7 +153,7 @@ class HealthMonitor:
             new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, speed, course, sensitivity())
             consistency.add(new)
         if consistency.is_waiting:
-            consistency.confirm(reported_us)
+            consistency.confirm(_reported_us(time_us, age))
         return variance + self._scatter.excess() + consistency.variance()
 
     def explain(self, difference: float, *, jumps: bool) -> None:
@@ -166,3 +167,8 @@ class HealthMonitor:
         self._consistency.restart()
         if jumps:
             self._trend.forget()
+
+
+def _reported_us(time_us: int, age: float) -> int:
+    """Return the time (µs) of the oldest telemetry, of age `age` (s) at `time_us` (µs)."""
+    return time_us - round(1e6 * min(age, MAX_AGE_S))

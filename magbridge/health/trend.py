@@ -279,6 +279,11 @@ class TrendCheck:
         self._agreed, self._unrest, self._quiet = 0, 0.0, BURST_SAMPLES
         self.has_moved = True
 
+    @property
+    def is_waiting(self) -> bool:
+        """True while telemetry may still explain a new jump."""
+        return self._new is not None
+
     def follow_telemetry(self, time_us: int, total: float) -> None:
         """Retract a new jump if changed telemetry brings the `total` field back to the level before it."""
         if self._new is not None:
