@@ -142,7 +142,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     slow_variance: float = 0.0
     """nT^2, variance of the slow noise: the sigma of the corrected field counts it."""
     lag: float = 0.0
-    """s, by which the reading is behind the vector: it is moved before the terms are taken off."""
+    """s, by which the reading is behind the vector: it is moved before the terms are subtracted."""
     width_covariance: tuple[tuple[float, ...], ...] = ()
     """Covariance of the coefficients that the uncertainty of the prior's widths adds to `covariance`."""
 

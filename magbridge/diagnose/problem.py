@@ -48,8 +48,8 @@ from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, 
 EACH, LAST = 16, 64
 """Highest number of half waves per log in slow noise: along each axis, and along the field."""
 MAX_MISSING_SAMPLES = 3
-"""Largest number of consecutive missing samples within a leg: a spline's rate beside such a gap keeps 98 % of
-the true power."""
+"""Largest number of consecutive missing samples within a leg: a spline's rate next to such a gap keeps 98 %
+of the true power."""
 WHITENED_ROWS = 2048
 """Rows that are whitened at a time, few enough for the processor's cache."""
 DERIVATIVE_ROWS = 8192

@@ -39,7 +39,7 @@ class SparseFactor:
         row, column = np.repeat(np.arange(n), np.diff(matrix.indptr)), matrix.indices
         self._order = self._rank = np.arange(n)
         # On a square of s x s nodes whose coupling reaches r strips, the band is r s wide, and nnz = 2 r² s².
-        # Of a track along a strip the band is wider: reverse Cuthill-McKee numbers nodes along the track.
+        # A track along a strip has a wider band: reverse Cuthill-McKee numbers nodes along the track.
         if np.abs(row - column).max() > matrix.nnz**0.5:
             self._order = reverse_cuthill_mckee(matrix, symmetric_mode=True)
             self._rank = np.argsort(self._order)

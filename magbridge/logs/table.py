@@ -273,7 +273,7 @@ class TableReader:
 def clock_by(path: Path, layout: Layout, rows: Rows) -> tuple[TimeFormat, list[str]]:
     """Return the format of the times, from the heading, the unit and the first cells, and assumptions.
 
-    FormatError: there is no time, or it can be read in two ways.
+    FormatError: the file has no time, or it can be read in two ways.
     """
     if layout.rate:
         return TimeFormat("s", f"{layout.rate:g} rows a second", boot=True), []

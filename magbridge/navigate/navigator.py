@@ -96,7 +96,7 @@ class Navigator:
         known = UNSTATED_SIGMA_M if sigma is None else sigma
         self._reckoning.advance(time_us * 1e-6)
         if not estimate.begun:
-            # There is no estimate to compare with: only the receiver's own report counts.
+            # Without an estimate to compare with, only the receiver's own report counts.
             wide, zero = np.eye(2) * 1e12, np.zeros(2)
             nothing = Prediction(zero, wide, wide, zero, estimate.options.current_sigma)
             state = monitor.check(time_us, place, (0.0, 0.0), known, nothing)

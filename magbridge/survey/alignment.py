@@ -296,7 +296,7 @@ class _JointFit:
         return climb(sums, choice, weighed, steps=CLIMB_STEPS)
 
     def _refine_field(self, choice: Choice, *, white: bool = False) -> Choice:
-        """Return the field and noise on finer nodes, with `white` noise or what is likelier."""
+        """Return the field and noise on finer nodes, with `white` noise or the likelier noise."""
         blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
         problem = self._problem(self.chosen, self.shift, blocks)
         field = choice.field

@@ -121,7 +121,7 @@ def calibrate_scalar(
 def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
     """Return a scalar magnetometer's reading (n,), nT, NaN for 0, from its declared unit.
 
-    DataError: it is no total field.
+    DataError: it is not a total field.
     """
     reading = ds[column].to_numpy().astype(float)
     unit = usual(str(ds[column].attrs.get("units", "")))
