@@ -43,7 +43,7 @@ from magbridge.field import read
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid
 from magbridge.mavlink import BAD_DATA, Codec, spec
-from magbridge.mavlink.messages import MESSAGES
+from magbridge.mavlink.messages import EXTRA
 from magbridge.mavlink.tlog import LogReader
 from magbridge.parts import OptionalParts
 from magbridge.records import Channel, Reading
@@ -200,7 +200,7 @@ HANDLED = (
     "VFR_HUD", *("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT", "NAMED_VALUE_FLOAT", "VFR_HUD") * 6,
 )  # fmt: skip
 """Messages that the bridge evaluates: nine of ten frames are from this list."""
-ANY = tuple(MESSAGES)
+ANY = tuple(EXTRA)
 SENDERS = (1, 1), (1, 1), (1, 1), (1, 25), (255, 190), (2, 1)
 STRETCH = 500
 """Events with a constant fraction of extreme values; a bridge without plausible fixes does not navigate."""

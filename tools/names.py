@@ -20,8 +20,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
-GENERATED = "mavlink/dialect.py", "mavlink/enums.py"
-"""Modules that tools/dialect.py writes, with pymavlink's names."""
+GENERATED = "mavlink/enums.py"
+"""Module that tools/dialect.py writes, with MAVLink's names."""
 PLUGIN_CLASSES = {"FileWriter"}
 """Classes that each module of a plug-in interface defines, with one meaning and several implementations."""
 BARE = (

@@ -18,7 +18,7 @@ from magbridge.link.parameters import (
 )
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
-from magbridge.mavlink.messages import MESSAGES
+from magbridge.mavlink.messages import EXTRA
 from magbridge.records import Corrected
 from magbridge.wording import one_of
 
@@ -250,7 +250,7 @@ class MessageRates:
 
         A message that is sent with every sample has the interval of `sample_rate` (Hz).
         """
-        rate = self.by_name.get(spec(number).name) if number in MESSAGES else None
+        rate = self.by_name.get(spec(number).name) if number in EXTRA else None
         if rate is None or rate.hertz < 0:
             return 0 if rate is None else -1
         hertz = rate.hertz or sample_rate
@@ -261,7 +261,7 @@ class MessageRates:
 
         Return the name of the rate's parameter; empty if the message has no rate or `hertz` is out of range.
         """
-        name = spec(number).name if number in MESSAGES else ""
+        name = spec(number).name if number in EXTRA else ""
         if name not in LIMITS:
             return ""
         parameter = rate_name(name)

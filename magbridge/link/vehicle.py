@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 from magbridge.link.output import Output
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE
-from magbridge.mavlink.messages import MESSAGES
 
 __all__ = ["VehicleClock", "VehicleState"]
 
@@ -206,10 +205,6 @@ LEAP_MS: Final = 10_000
 autopilot explains, ms."""
 TWICE, CHANGES_US = 5, 10_000_000
 """Number of changes between two boot clocks, and the time (µs) within which they mean two autopilots."""
-HAS_BOOT_TIME: Final = {
-    number for number, layout in MESSAGES.items() if layout.fieldunits_by_name.get("time_boot_ms") == "ms"
-}
-"""Ids of the messages with the field ``time_boot_ms``."""
 
 
 class VehicleState:
@@ -257,9 +252,8 @@ class VehicleState:
             return False
         self.count(message, t_us)
         if message.component == self.autopilot:
-            if message.id in HAS_BOOT_TIME:
-                boot_ms = spec(message.id).fields["time_boot_ms"].get(message.payload)
-                self._watch_boot(message.id, boot_ms, t_us)
+            if (boot_time := spec(message.id).fields.get("time_boot_ms")) is not None:
+                self._watch_boot(message.id, boot_time.get(message.payload), t_us)
             elif message.id == HEARTBEAT:
                 self._present(t_us)
         return True

@@ -1,9 +1,9 @@
 """Messages of pymavlink's dialect ``all`` and of magbridge: layouts, received messages, frames.
 
-pymavlink's classes define the layouts by which fields are read, and pymavlink computes checksums. This module
-finds the frames in a stream of bytes, in place of pymavlink's ``parse_char``. After a wrong checksum,
-``parse_char`` skips as many bytes as the header states, so that garbage that looks like a header hides valid
-frames (ArduPilot/pymavlink#387).
+pymavlink's classes define the layouts by which fields are read, `LAYOUTS` those that pymavlink lacks. This
+module finds the frames in a stream of bytes, in place of pymavlink's ``parse_char``. After a wrong
+checksum, ``parse_char`` skips as many bytes as the header states, so that garbage that looks like a header
+hides valid frames (ArduPilot/pymavlink#387).
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from pymavlink.dialects.v20.all import (
     x25crc,
 )
 
-from magbridge.mavlink import dialect
-from magbridge.mavlink.enums import INVALID
+from magbridge.mavlink.enums import INVALID, LAYOUTS
 
 __all__ = [
-    "BAD_DATA", "EXTRA", "MAX_MESSAGE_ID", "MESSAGES", "MESSAGE_IDS", "NEEDS_MORE", "REFUSED", "SECRET",
+    "BAD_DATA", "EXTRA", "MAX_MESSAGE_ID", "MESSAGE_IDS", "NEEDS_MORE", "REFUSED", "SECRET",
     "SIGNATURE", "SIGNED", "V1", "V2", "Field", "Message", "Source", "Spec", "by_id", "checksum", "east_e7",
     "find_magic", "frame_end", "is_signed", "message", "spec", "split_index", "without_secret",
     "without_secrets",
@@ -42,11 +41,26 @@ T = TypeVar("T")
 TURN_E7 = 3_600_000_000
 """Full circle, 1e-7 deg."""
 
-MESSAGES: Final[dict[int, Any]] = {**upstream.mavlink_map, **dialect.mavlink_map}
-"""Message id -> pymavlink's class of the message; classes of our own dialect take precedence."""
-upstream.mavlink_map.update(dialect.mavlink_map)  # pymavlink's decoder takes the classes from there
-MESSAGE_IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
+MESSAGE_IDS: Final[dict[str, int]] = {
+    **{layout.msgname: number for number, layout in upstream.mavlink_map.items()},
+    **{name: number for number, (name, *_) in LAYOUTS.items()},
+}
 """Message name -> id."""
+EXTRA: Final = {
+    **{number: bytes((layout.crc_extra,)) for number, layout in upstream.mavlink_map.items()},
+    **{number: bytes((extra,)) for number, (_, extra, _) in LAYOUTS.items()},
+}
+"""Message id -> CRC_EXTRA, the last byte that the message's checksum covers."""
+
+
+def definition(number: int) -> tuple[str, int, list[tuple[str, str, int, str]]]:
+    """Return name, CRC_EXTRA and fields of a message, in the form of `LAYOUTS`."""
+    if number in LAYOUTS:
+        return LAYOUTS[number]
+    its = upstream.mavlink_map[number]
+    names, codes = its.ordered_fieldnames, its.native_format.decode()[1:].replace("c", "s")
+    units = [its.fieldunits_by_name.get(name, "") for name in names]
+    return its.msgname, its.crc_extra, list(zip(names, codes, its.array_lengths, units, strict=True))
 
 
 class Field:
@@ -60,13 +74,9 @@ class Field:
 
     __slots__ = ("code", "count", "invalid", "name", "offset", "struct", "unit")
 
-    def __init__(self, layout: Any, index: int, offset: int) -> None:
-        self.name = layout.ordered_fieldnames[index]
-        self.unit = layout.fieldunits_by_name.get(self.name, "")
-        self.invalid = INVALID.get(layout.msgname, {}).get(self.name)
-        self.count = layout.array_lengths[index]
-        self.code = chr(layout.native_format[index + 1]).replace("c", "s")  # after the byte order
-        self.offset = offset
+    def __init__(self, name: str, code: str, count: int, unit: str, offset: int, invalid: int | None) -> None:
+        self.name, self.code, self.count, self.unit = name, code, count, unit
+        self.offset, self.invalid = offset, invalid
         packed_as_bytes = self.count and self.code in "sB"  # 253 integers a message would be slow
         self.struct = Struct(f"<{self.count}s" if packed_as_bytes else f"<{self.count or ''}{self.code}")
 
@@ -85,7 +95,7 @@ class Field:
 
 
 class Spec:
-    """Layout of one message, from pymavlink's class of the message.
+    """Layout of one message.
 
     `id`: message id.
     `name`: message name.
@@ -97,17 +107,14 @@ class Spec:
     """
 
     def __init__(self, number: int) -> None:
-        layout = MESSAGES[number]
         self.id = number
-        self.name: str = layout.msgname
-        self.extra: int = layout.crc_extra
-        self.size: int = layout.unpacker.size
+        self.name, self.extra, rows = definition(number)
         self.fields: dict[str, Field] = {}
-        offset, form = 0, "<"
-        for index in range(len(layout.ordered_fieldnames)):
-            field = Field(layout, index, offset)
+        self.size, form = 0, "<"
+        for row in rows:
+            field = Field(*row, self.size, INVALID.get(self.name, {}).get(row[0]))
             self.fields[field.name] = field
-            offset += field.struct.size
+            self.size += field.struct.size
             form += field.struct.format[1:]
         self.struct = Struct(form)
         zeros = bytes(self.size)
@@ -207,8 +214,6 @@ NOT_A_FRAME: Final = 0
 NEEDS_MORE: Final = -1
 MAX_MESSAGE_ID: Final = 0xFFFF
 """Largest message id that is accepted of a message outside the dialect."""
-EXTRA: Final = {number: bytes((layout.crc_extra,)) for number, layout in MESSAGES.items()}
-"""Message id -> CRC_EXTRA, the last byte that the message's checksum covers."""
 
 
 def checksum(data: bytes, extra: bytes) -> int:

@@ -7,22 +7,24 @@ messages in which the log stores the sensor's bytes.
 from __future__ import annotations
 
 import gc
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 from benchmarks.row import Row, processor_time
 from benchmarks.workload import BEGIN_US, Feed, write_config
-from pymavlink.dialects.v20.all import MAVLink
 
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline, drive, set_up
 from magbridge.config import load
 from magbridge.logs.tlog import TlogWriter
-from magbridge.mavlink.messages import MESSAGES, spec  # adds the project's messages to pymavlink's decoder
+from magbridge.mavlink.definitions import write_definitions
 from magbridge.records import Channel
 
 HERTZ = 100
@@ -36,12 +38,15 @@ LEARNING = "[learning]\nenabled = true\n"
 
 
 class Peer:
-    """pymavlink's codec, which decodes the bridge's input and encodes its output."""
+    """pymavlink's codec for the dialect, which decodes the bridge's input and encodes its output."""
 
-    def __init__(self) -> None:
-        self._in = MAVLink(None)
+    def __init__(self, folder: Path) -> None:
+        write_definitions(folder)
+        with patch("sys.path", [str(folder), *sys.path]):
+            self._dialect = import_module("magbridge_dialect")
+        self._in = self._dialect.MAVLink(None)
         self._in.robust_parsing = True
-        self._out = MAVLink(None, srcSystem=1, srcComponent=191)
+        self._out = self._dialect.MAVLink(None, srcSystem=1, srcComponent=191)
 
     def decode(self, pieces: Iterable[bytes]) -> int:
         """Decode bytes in pieces; return the number of messages."""
@@ -49,12 +54,12 @@ class Peer:
 
     def arguments(self, published: bytes) -> list[tuple[type, tuple[Any, ...]]]:
         """Return class and arguments of each message of a stream, for :meth:`encode`."""
-        messages = MAVLink(None).parse_buffer(published) or []
+        messages = self._dialect.MAVLink(None).parse_buffer(published) or []
         return [(type(one), tuple(self._argument(one, name) for name in one.fieldnames)) for one in messages]
 
     def sensor_bytes(self, data: bytes) -> tuple[type, tuple[Any, ...]]:
         """Return class and arguments of the log's message that stores the bytes of a sensor."""
-        return MESSAGES[spec("MAG_SENSOR_BYTES").id], (0, len(data), list(data.ljust(253, b"\0")))
+        return self._dialect.MAVLink_mag_sensor_bytes_message, (0, len(data), list(data.ljust(253, b"\0")))
 
     @staticmethod
     def _argument(message: Any, name: str) -> Any:
@@ -104,7 +109,7 @@ def processor(folder: Path, repetitions: int) -> list[Row]:
 def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[float]]:
     """Return the processor time of a sample in each repetition, µs, by kind of work."""
     pipeline = set_up(load(write_config(folder)), StartEvent(BEGIN_US))
-    feed, peer, log = Feed(moving=moving), Peer(), TlogWriter(folder / "logs")
+    feed, peer, log = Feed(moving=moving), Peer(folder), TlogWriter(folder / "logs")
     samples = SECONDS * HERTZ
     times: dict[str, list[float]] = {"bridge": [], "decode": [], "encode": [], "encode_log": []}
 

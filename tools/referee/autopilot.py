@@ -10,7 +10,7 @@ from typing import NamedTuple
 from magbridge.field.geodesy import offset, separation
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_FRAME, MAV_RESULT, MAV_TYPE
-from magbridge.mavlink.messages import MESSAGES, east_e7
+from magbridge.mavlink.messages import EXTRA, east_e7
 
 Pair = tuple[float, float]
 
@@ -268,12 +268,13 @@ class Autopilot:
         ``GCS_Common.cpp``, set_message_interval: from 1 ms to 60 s, FAILED for an unknown message;
         ``mavlink_receiver.cpp``, set_message_interval: FAILED for an unknown stream.
         """
-        layout = MESSAGES.get(int(message["param1"]))
-        if layout is None or layout.msgname not in self._messages:
+        number = int(message["param1"])
+        name = spec(number).name if number in EXTRA else ""
+        if name not in self._messages:
             return MAV_RESULT.FAILED
         if self.rates is not None:
-            self.rates[layout.msgname] = 1e6 / min(max(message["param2"], 1e3), 6e7)
-            self._next_us.pop(layout.msgname, None)
+            self.rates[name] = 1e6 / min(max(message["param2"], 1e3), 6e7)
+            self._next_us.pop(name, None)
         return MAV_RESULT.ACCEPTED
 
     def _status(self, truth: Truth) -> bytes:
