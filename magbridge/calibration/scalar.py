@@ -251,10 +251,7 @@ def scalar_design(
 
 
 def _rate(values: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative by time, (n,) or (n, 3), over the known rows; NaN in the others.
-
-    Samples of one time have one derivative.
-    """
+    """Return the derivative by time, (n,) or (n, 3), over the known rows; NaN in the others."""
     known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     moments, first, same = np.unique(time[known], return_index=True, return_inverse=True)
     rate = np.where(np.isfinite(values), 0.0, np.nan)
@@ -315,13 +312,12 @@ def _common_variance(
     is correlated with that of the terms. `cross` (n, m) and `level_sigma` (n,) are those of :func:`_level`.
     """
     variance = np.full(len(design), np.nan)
-    _, cycle = np.unique(np.column_stack([level_sigma, cross]), axis=0, return_inverse=True)
-    for index in range(cycle.max(initial=-1) + 1):
-        rows = cycle.ravel() == index
+    for level in np.unique(np.column_stack([level_sigma, cross]), axis=0):
+        rows = (level_sigma == level[0]) & (cross == level[1:]).all(axis=1)
         known = design[rows & np.isfinite(design).all(axis=1)]
         if len(known):
-            mean, first = known.mean(axis=0), int(rows.argmax())
-            common = mean @ covariance @ mean + 2.0 * mean @ cross[first] + level_sigma[first] ** 2
+            mean = known.mean(axis=0)
+            common = mean @ covariance @ mean + 2.0 * mean @ level[1:] + level[0] ** 2
             variance[rows] = max(float(common), 0.0)
     return variance
 
@@ -338,11 +334,11 @@ def unknown_direction_variance(sensor: ScalarSensor, channels: FloatArray) -> Fl
     induced = symmetric(mean[None, PLATFORM_COLUMNS["induced"]])[0]
     induced -= np.trace(induced) / 3.0 * np.eye(3)
     constant = float((mean[PLATFORM_COLUMNS["permanent"]] ** 2).sum() + (induced**2).sum())
-    z = np.array([(channels[:, k] - one.centre) / one.scale for k, one in enumerate(sensor.channels)])
-    fields = mean[PLATFORM_TERMS : PLATFORM_TERMS + 3 * len(sensor.channels)].reshape(-1, 3)
-    return np.asarray(
-        constant + (np.nan_to_num(z) ** 2).T @ (fields**2).sum(axis=1) + np.zeros(len(channels))
-    )
+    variance = np.full(len(channels), constant)
+    for k, one in enumerate(sensor.channels):
+        field = mean[PLATFORM_TERMS + 3 * k : PLATFORM_TERMS + 3 * k + 3]
+        variance += np.nan_to_num((channels[:, k] - one.centre) / one.scale) ** 2 * (field @ field)
+    return variance
 
 
 def _level(
@@ -417,11 +413,8 @@ def compare_sensors(
 def _expected_field(
     mean: FloatArray, reference: FloatArray, disagrees: BoolArray
 ) -> tuple[FloatArray, float]:
-    """Return the field that both sensors should read (n,), nT, and its 1-sigma, nT.
-
-    `mean` (n,) is that of both sensors. Where they agree, `mean` minus the reference is the crustal field.
-    Without a reference, `mean` itself is interpolated over the samples at which they disagree.
-    """
+    """Return the field that both sensors should read (n,), nT, and its 1-sigma, from their `mean` (n,)."""
+    # where they agree, mean - reference is the crustal field; without a reference, interpolate the mean
     rows = np.flatnonzero(np.isfinite(mean) & ~disagrees)
     base = reference if np.isfinite(reference).any() else np.zeros(len(mean))
     rows = rows[np.isfinite(base[rows])]

@@ -23,7 +23,7 @@ those that harm, but a physical width does.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, starmap
 from typing import Any
 
 import msgspec
@@ -101,8 +101,6 @@ ROUNDING = 1e-10
 """Fraction of the crustal variance that is added to each step, whose own variance is lost in rounding."""
 OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 """Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
-
-
 LEAST_GAIN = 0.99
 """RMS after compensation in units of that before it, from which on nothing is improved."""
 FALSE_NAME_LEVEL = 1e-3
@@ -124,7 +122,6 @@ class ScalarFit:
     """Samples that were left out as outliers."""
     removed: float
     """Median of reading minus reference, nT."""
-    log_evidence: float
     findings: tuple[Diagnostic, ...] = ()
     """Statistically significant lag, and channels that disturb the scalar (:data:`FALSE_NAME_LEVEL`)."""
     merit: dict[str, Any] | None = None
@@ -134,7 +131,7 @@ class ScalarFit:
     def lag_sigma(self) -> float:
         """1-sigma of the lag, s; 0 for a given lag."""
         variance = self.sensor.total_covariance[LAG, LAG]
-        return float(np.sqrt(variance)) if self.sensor.prior_sigma[LAG] > 1e-6 else 0.0
+        return 0.0 if _has_fixed_lag(self.sensor) else float(np.sqrt(variance))
 
     @property
     def doubt(self) -> str:
@@ -170,10 +167,8 @@ def fit_scalar(
 
     CalibrationError: too few samples, or a constant direction.
     """
-    valid = (
-        np.isfinite(series.scalar) & np.isfinite(series.vector).all(axis=1) & np.isfinite(series.reference)
-    )
-    valid &= np.isfinite(series.channels).all(axis=1)
+    needed = np.column_stack([series.scalar, series.vector, series.reference, series.channels])
+    valid = np.asarray(np.isfinite(needed).all(axis=1))
     if valid.sum() < MIN_SCALAR_SAMPLES:
         raise CalibrationError(
             f"{column}: expected at least {MIN_SCALAR_SAMPLES} samples with vector, reference and "
@@ -186,14 +181,8 @@ def fit_scalar(
     valid &= _agreeing(series, valid, channels, reference_field)
     shift, terms = _first_lag(series, valid, channels, reference_field, lag)
     series = series._replace(scalar=moved_earlier(series.scalar, series.time, shift))
-    problem = _ScalarProblem.build(
-        series,
-        valid & np.isfinite(series.scalar),
-        channels,
-        reference_field,
-        terms,
-        fixed_lag=lag is not None,
-    )
+    valid &= np.isfinite(series.scalar)
+    problem = _ScalarProblem.build(series, valid, channels, reference_field, terms, fixed_lag=lag is not None)
     kept = np.ones(len(problem.target), bool)
     start: FloatArray | None = None
     with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
@@ -299,22 +288,21 @@ def _findings(
     sensor: ScalarSensor, contribution: dict[str, float], channels: tuple[ScalarChannel, ...]
 ) -> tuple[Diagnostic, ...]:
     """Return the lag if it is not zero, then the channels that disturb the scalar, the strongest first."""
-    names, column = [channel.name for channel in channels], sensor.column
+    names, column, terms = [channel.name for channel in channels], sensor.column, term_columns(channels)
     mean, covariance = np.array(sensor.coefficients), np.array(sensor.covariance)
     mean[LAG] -= sensor.lag
-    significant = {
-        name: is_significant(mean[term], covariance[term, term], len(names) + 1)
-        for name, term in term_columns(channels).items()
-        if name == "lag" or name in names
-    }
+
+    def significant(name: str) -> bool:
+        term = terms[name]
+        return is_significant(mean[term], covariance[term, term], len(names) + 1)
+
     found = []
-    if significant["lag"] and sensor.prior_sigma[LAG] > 1e-6:  # not a given one
+    if significant("lag") and not _has_fixed_lag(sensor):
         sigma = float(np.sqrt(covariance[LAG, LAG]))
         found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": sensor.lag, "sigma_s": sigma}))
-    for name in sorted(names, key=lambda name: -contribution[name]):
-        if significant[name]:
-            values = {"column": column, "channel": name, "effect_nT": contribution[name]}
-            found.append(Diagnostic("scalar.channel", values))
+    for name in filter(significant, sorted(names, key=lambda name: -contribution[name])):
+        values = {"column": column, "channel": name, "effect_nT": contribution[name]}
+        found.append(Diagnostic("scalar.channel", values))
     return tuple(found)
 
 
@@ -349,7 +337,6 @@ class _ScalarProblem:
     design: FloatArray
     """(n, m), all columns, levels last."""
     family: PriorFamily
-    segments: tuple[slice, ...]
     interval: float
     cycles: tuple[int | None, ...]
     averaged: int
@@ -370,10 +357,9 @@ class _ScalarProblem:
         target = series.scalar - series.reference
         if fixed_lag:
             design[:, LAG] = 0.0
-        numbers, cycles = _power_cycles(series.power_cycle[valid])
-        levels = np.zeros((len(target), len(cycles)))
-        levels[np.flatnonzero(valid), numbers] = 1.0
-        table = np.column_stack([series.time, target, design, levels])[valid]
+        cycles, number = np.unique(np.nan_to_num(series.power_cycle[valid], nan=-1.0), return_inverse=True)
+        table = np.column_stack([series.time, target, design])[valid]
+        table = np.hstack([table, np.eye(len(cycles))[number]])  # a level for each power cycle
         # Average neighbours, never across a gap.
         piece = np.cumsum(np.diff(table[:, 0], prepend=table[0, 0]) > FILTER_GAP_INTERVALS * step)
         first = np.flatnonzero(np.diff(piece, prepend=-1))
@@ -381,18 +367,12 @@ class _ScalarProblem:
         _, starts, counts = np.unique(group, return_index=True, return_counts=True)
         table = np.add.reduceat(table, starts, axis=0) / counts[:, None]
         family = _prior_family(channels, len(cycles), fixed_lag=fixed_lag)
-        return _ScalarProblem(
-            table[:, 0], table[:, 1], table[:, 2:], family, _segments(table[:, 0], many * step), many * step,
-            cycles, many,
-        )  # fmt: skip
+        known = tuple(None if label < 0.0 else int(label) for label in cycles.tolist())
+        return _ScalarProblem(table[:, 0], table[:, 1], table[:, 2:], family, many * step, known, many)
 
     def part(self, kept: BoolArray) -> _ScalarProblem:
         """Return the problem of some samples."""
-        time = self.time[kept]
-        return replace(
-            self, time=time, target=self.target[kept], design=self.design[kept],
-            segments=_segments(time, self.interval),
-        )  # fmt: skip
+        return replace(self, time=self.time[kept], target=self.target[kept], design=self.design[kept])
 
     def whiten(self, log_noise: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return the whitened target and design, and the log of the noise's determinant.
@@ -406,7 +386,8 @@ class _ScalarProblem:
         slow = _SlowNoise.build(log_noise, self.interval)
         both = np.column_stack([self.target, self.design])
         log_det = len(both) * float(np.log(slow.variance))
-        for segment in self.segments:
+        gaps = np.flatnonzero(np.diff(self.time) > FILTER_GAP_INTERVALS * self.interval) + 1
+        for segment in starmap(slice, pairwise([0, *gaps.tolist(), len(both)])):
             initial = slow.initial_effect(self.time[segment] - self.time[segment.start])
             filtered = sosfilt(slow.sections, np.column_stack([both[segment], initial]), axis=0)
             filtered /= np.sqrt(slow.variance)
@@ -483,22 +464,18 @@ class _ScalarProblem:
             return np.asarray(found.x)
 
         if start is None:
-            for one in self.starts(map_known=map_known):
+            # logs of the amplitudes, nT, and of the crustal time scale, s
+            white = np.log(max(robust_scale(np.diff(self.target) / np.sqrt(2.0)), 1e-3))
+            crust = [] if map_known else LOG_CRUST_CENTRES
+            for amplitude in NOISE_STARTS_NT:
+                slow = np.full(len(TIME_CONSTANTS_S), np.log(amplitude))
                 warm = self.family.centre
-                search(one, START_ITERATIONS)
+                search(np.concatenate([[white], slow, crust]), START_ITERATIONS)
             assert best is not None
             start = best.log_noise
         search(start, EVIDENCE_ITERATIONS)
         assert best is not None
         return best
-
-    def starts(self, *, map_known: bool) -> list[FloatArray]:
-        """Return the starts of the search: logs of the amplitudes, nT, and of the crustal time scale, s."""
-        rough = np.diff(self.target) / np.sqrt(2.0)
-        white = np.log(max(robust_scale(rough), 1e-3))
-        crust = [] if map_known else LOG_CRUST_CENTRES
-        slow = [np.full(len(TIME_CONSTANTS_S), np.log(amplitude)) for amplitude in NOISE_STARTS_NT]
-        return [np.concatenate([[white], processes, crust]) for processes in slow]
 
     def outliers(self, state: _Posterior, kept: BoolArray) -> BoolArray:
         """Return samples (n,) whose whitened residual is far too large, with their neighbours."""
@@ -534,8 +511,8 @@ def _coefficients(data: GaussianInformation, sigma: FloatArray) -> tuple[FloatAr
     return covariance @ data.vector, covariance
 
 
-def _width_covariance(data: GaussianInformation, family: PriorFamily, log_widths: FloatArray) -> FloatArray:
-    """Return the covariance (m, m) of the coefficients that the uncertainty of the widths adds.
+def _marginal(sensor: ScalarSensor, data: GaussianInformation) -> ScalarSensor:
+    """Return the sensor with the covariance that the uncertainty of its prior's widths adds.
 
     Notes
     -----
@@ -544,6 +521,7 @@ def _width_covariance(data: GaussianInformation, family: PriorFamily, log_widths
     summed over one width after another on a grid of its log, the others at their mode (Rasmussen & Williams
     2006, section 5.2).
     """
+    family, log_widths = _sensor_prior(sensor)
     _, at_mode = _coefficients(data, family.widths(log_widths))
     added = np.zeros_like(at_mode)
     for index in np.flatnonzero(family.spread):
@@ -558,21 +536,19 @@ def _width_covariance(data: GaussianInformation, family: PriorFamily, log_widths
         added += (weight[:, None] * offset).T @ offset
     # The widths that were chosen are less probable than narrower ones: the sum may be slightly negative.
     size, axes = np.linalg.eigh(added)
-    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+    added = (axes * np.maximum(size, 0.0)) @ axes.T
+    return msgspec.structs.replace(sensor, width_covariance=tuple(map(tuple, added.tolist())))
 
 
-def _marginal(sensor: ScalarSensor, data: GaussianInformation) -> ScalarSensor:
-    """Return the sensor with the covariance that the uncertainty of its prior's widths adds."""
-    prior = np.array(sensor.prior_sigma)
-    family = _sensor_family(sensor)
-    added = _width_covariance(data, family, np.log(prior[family.design.argmax(axis=0)]))
-    return msgspec.structs.replace(sensor, width_covariance=tuple(tuple(row) for row in added.tolist()))
+def _has_fixed_lag(sensor: ScalarSensor) -> bool:
+    return sensor.prior_sigma[LAG] < 1e-6
 
 
-def _sensor_family(sensor: ScalarSensor) -> PriorFamily:
-    """Return the prior of a sensor's coefficients."""
-    fixed_lag = sensor.prior_sigma[PLATFORM_TERMS - 1] < 1e-6
-    return _prior_family(sensor.channels, len(sensor.power_cycles), fixed_lag=fixed_lag)
+def _sensor_prior(sensor: ScalarSensor) -> tuple[PriorFamily, FloatArray]:
+    """Return the prior of a sensor's coefficients, and the log widths that the fit chose."""
+    cycles = len(sensor.power_cycles)
+    family = _prior_family(sensor.channels, cycles, fixed_lag=_has_fixed_lag(sensor))
+    return family, np.log(np.array(sensor.prior_sigma)[family.design.argmax(axis=0)])
 
 
 def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
@@ -604,13 +580,12 @@ def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
     data = GaussianInformation(
         (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor, moment * factor
     )
-    adapted = msgspec.structs.replace(sensor, channels=tuple(wider))
-    family = _sensor_family(adapted)
-    chosen = _choose_widths(data, family, np.log(prior[family.design.argmax(axis=0)]))
+    chosen = _choose_widths(data, *_sensor_prior(sensor))
     adapted = msgspec.structs.replace(
-        adapted,
+        sensor,
+        channels=tuple(wider),
         coefficients=tuple(chosen.mean.tolist()),
-        covariance=tuple(tuple(row) for row in chosen.covariance.tolist()),
+        covariance=tuple(map(tuple, chosen.covariance.tolist())),
         prior_sigma=tuple(chosen.prior_sigma.tolist()),
     )
     return _marginal(adapted, data)
@@ -628,15 +603,6 @@ def _log_noise_prior(log_noise: FloatArray) -> float:
     return -0.5 * float(value)
 
 
-def _power_cycles(
-    numbers: FloatArray,
-) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], tuple[int | None, ...]]:
-    """Return the index of each sample's power cycle and the cycles' numbers."""
-    labels = np.where(np.isnan(numbers), -1.0, numbers)
-    found, index = np.unique(labels, return_inverse=True)
-    return index, tuple(None if label < 0.0 else int(label) for label in found.tolist())
-
-
 def _prior_family(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool) -> PriorFamily:
     """Return the prior of the coefficients: free widths, except for the lag and the levels."""
     widths = {name: (centre, LOG_WIDTH_SIGMA) for name, centre in WIDTH_CENTRES_NT.items()}
@@ -648,13 +614,6 @@ def _prior_family(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag
         blocks.append(ParameterBlock(name, np.empty((0, size)), np.ones(size), width, spread))
     blocks.append(ParameterBlock("level", np.empty((0, levels)), np.ones(levels), CYCLE_LEVEL_SIGMA_NT))
     return with_blocks(NO_COEFFICIENTS, tuple(blocks))
-
-
-def _segments(time: FloatArray, interval: float) -> tuple[slice, ...]:
-    """Return the stretches of samples without a gap."""
-    breaks = np.flatnonzero(np.diff(time) > FILTER_GAP_INTERVALS * interval) + 1
-    ends = [0, *breaks.tolist(), len(time)]
-    return tuple(slice(begin, end) for begin, end in pairwise(ends))
 
 
 def _slow_variances(log_noise: FloatArray) -> FloatArray:
@@ -775,7 +734,7 @@ def _result(
         channels=channels,
         coefficients=tuple(mean.tolist()),
         lag=total_lag,
-        covariance=tuple(tuple(row) for row in state.covariance.tolist()),
+        covariance=tuple(map(tuple, state.covariance.tolist())),
         prior_sigma=tuple(state.prior_sigma.tolist()),
         noise=ScalarNoise(
             averaged_white * float(np.sqrt(problem.averaged)), problem.interval / problem.averaged,
@@ -792,6 +751,5 @@ def _result(
     return ScalarFit(
         sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
         int((~kept).sum()) * problem.averaged, float(np.nanmedian(series.scalar - series.reference)),
-        -state.cost,
         _findings(sensor, contribution, channels),
     )  # fmt: skip

@@ -107,8 +107,7 @@ def calibrate_scalar(
     rows = at_one_time(ds)
     time = np.asarray(ds["time"].to_numpy(), float)
     field = np.stack([rows[name].to_numpy().astype(float) for name in CHANNELS], axis=1)
-    channels = [_at_rows(time, ds, name) for name in calibration.channels]
-    corrected = correct(calibration, field, np.stack(channels, axis=1) if channels else field[:, :0], time)
+    corrected = correct(calibration, field, _channels(ds, calibration.channels), time)
     series = _series(ds, column, names, corrected.vector, reference)
     units = tuple(str(ds[name].attrs.get("units", "")) for name in names)
     fit = fit_scalar(
@@ -181,14 +180,9 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
     doubtful = _doubtful_direction(corrected)
     variance = seen.scalar_variance
     variance[doubtful] += unknown_direction_variance(adapted, series.channels)[doubtful]
-    quality = np.zeros(len(found.field), int)
-    for flag, rows in (
-        (ScalarQuality.EXTRAPOLATED, found.extrapolated),
-        (ScalarQuality.DISAGREES, seen.disagrees | doubtful),
-        (ScalarQuality.JUMP, seen.jump),
-        (ScalarQuality.MISSING, found.missing),
-    ):
-        quality[rows] |= int(flag)
+    quality = int(ScalarQuality.EXTRAPOLATED) * found.extrapolated
+    quality = quality + int(ScalarQuality.DISAGREES) * (seen.disagrees | doubtful)
+    quality += int(ScalarQuality.JUMP) * seen.jump + int(ScalarQuality.MISSING) * found.missing
     widened = np.sqrt(found.sigma**2 + variance)
     columns = found.field, widened, found.level_sigma, quality.astype(float)
     added = {
@@ -201,10 +195,8 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
 
 
 def _doubtful_direction(corrected: xr.Dataset) -> BoolArray:
-    """Return the samples (n,) whose vector is implausible; all, if it is at more than half of them.
-
-    The checks of the vector need some samples after a turn, so that a wrong axis is not flagged everywhere.
-    """
+    """Return the samples (n,) whose vector is implausible; all, if it is at more than half of them."""
+    # the checks need some samples after a turn, so that a wrong axis is not flagged everywhere
     flags = np.asarray(corrected.get("quality", np.zeros(corrected.sizes["time"])), float)
     implausible = (np.nan_to_num(flags).astype(int) & int(Quality.IMPLAUSIBLE)) > 0
     return np.asarray(implausible | (implausible.mean() > 0.5))
@@ -247,10 +239,7 @@ def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> 
 def _compensated(
     corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor
 ) -> tuple[CorrectedScalar, SensorDisagreement, ScalarSensor, ScalarSeries]:
-    """Return compensation and comparison with the vector, the sensor adapted to the log, and its samples.
-
-    FormatError: a channel is missing.
-    """
+    """Return compensation and comparison with the vector, the sensor adapted to the log, and its samples."""
     if missing := [channel.name for channel in sensor.channels if channel.name not in log]:
         source = log.attrs.get("source", "the log")
         raise FormatError(source, f"column {missing[0]!r} is missing: the scalar's compensation needs it")
@@ -269,7 +258,6 @@ def _series(
 ) -> ScalarSeries:
     """Return the rows of a log as arrays, telemetry interpolated to them."""
     time = np.asarray(ds["time"].to_numpy(), float)
-    channels = [_at_rows(time, ds, name) for name in names]
     expected = reference if np.isfinite(reference).any() else np.linalg.norm(vector, axis=1)
     cycle = ds["power_cycle"].to_numpy().astype(float) if "power_cycle" in ds else np.full(len(time), np.nan)
     return ScalarSeries(
@@ -277,21 +265,25 @@ def _series(
         _without_repeated(scalar_reading(ds, column), expected),
         vector,
         reference,
-        np.stack(channels, axis=1) if channels else np.empty((len(time), 0)),
+        _channels(ds, names),
         cycle,
     )
 
 
-def _at_rows(time: FloatArray, ds: xr.Dataset, name: str) -> FloatArray:
-    """Return a channel at every row (n,): interpolated where it has values close enough on both sides."""
-    values = ds[name].to_numpy().astype(float)
-    known = np.isfinite(values)
-    if known.all() or known.sum() < 2:
-        return np.asarray(values)
-    filled = np.interp(time, time[known], values[known], left=np.nan, right=np.nan)
-    after = np.searchsorted(time[known], time).clip(1, known.sum() - 1)
-    far = time[known][after] - time[known][after - 1] > MAX_CHANNEL_GAP_S
-    return np.where(known, values, np.where(far, np.nan, filled))
+def _channels(ds: xr.Dataset, names: Sequence[str]) -> FloatArray:
+    """Return channels (n, k) at every row: interpolated between values that are close enough in time."""
+    time = np.asarray(ds["time"].to_numpy(), float)
+    table = np.empty((len(time), len(names)))
+    for k, name in enumerate(names):
+        table[:, k] = values = ds[name].to_numpy().astype(float)
+        known = np.isfinite(values)
+        if known.all() or known.sum() < 2:
+            continue
+        filled = np.interp(time, time[known], values[known], left=np.nan, right=np.nan)
+        after = np.searchsorted(time[known], time).clip(1, known.sum() - 1)
+        far = time[known][after] - time[known][after - 1] > MAX_CHANNEL_GAP_S
+        table[:, k] = np.where(known, values, np.where(far, np.nan, filled))
+    return table
 
 
 def moved_to_sensor(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dataset:
@@ -302,13 +294,12 @@ def moved_to_sensor(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dat
     if not any(lever) or not {"latitude", "longitude"} <= set(ds.variables):
         return ds
     require(ds, ("heading",))
-    level = np.zeros(ds.sizes["time"])
-    angles = [
-        ds[name].to_numpy().astype(float) if name in ds else level for name in ("heading", "pitch", "roll")
-    ]
-    known: BoolArray = np.isfinite(np.stack(angles)).all(axis=0)
-    turned = np.zeros((len(known), 3))
-    turned[known] = Rotation.from_euler("ZYX", np.stack(angles, axis=1)[known], degrees=True).apply(lever)
+    angles = np.zeros((ds.sizes["time"], 3))
+    for k, name in enumerate(("heading", "pitch", "roll")):
+        angles[:, k] = ds.get(name, 0.0)
+    known = np.isfinite(angles).all(axis=1)
+    turned = np.zeros_like(angles)
+    turned[known] = Rotation.from_euler("ZYX", angles[known], degrees=True).apply(lever)
     moved = {}
     degrees = metres_per_degree(ds["latitude"].to_numpy())
     for k, name in enumerate(("latitude", "longitude")):
