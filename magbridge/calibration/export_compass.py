@@ -40,9 +40,8 @@ from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 
-AUTOPILOT_AXES = "X", "Y", "Z"
-OFF = (0, 1), (0, 2), (1, 2)
-"""Row and column of the entries of a symmetric matrix off its diagonal."""
+OFF = np.array([0, 0, 1]), np.array([1, 2, 2])
+"""Rows and columns of the entries of a symmetric matrix off its diagonal."""
 FLOAT, INTEGER = 9, 6
 """Values of MAV_PARAM_TYPE in a QGroundControl parameter file: REAL32 and INT32."""
 RANGE_POINTS = 41
@@ -104,50 +103,44 @@ def _middle(calibration: Calibration) -> FloatArray:
     return np.array([0.5 * (one.low + one.high) for one in calibration.parameters])
 
 
+def _by_axis(pattern: str, values: FloatArray) -> dict[str, float]:
+    """Return the parameters of the three axes, whose names follow `pattern`, with their values (3,)."""
+    return {pattern.format(axis): value for axis, value in zip("XYZ", values.tolist(), strict=True)}
+
+
 def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
     """Return the text of an ArduPilot ``.param`` file for compass `number` (from 0), and warnings."""
     mG = NT_PER_UNIT["mG"]
     n = "" if number == 0 else str(number + 1)
     # ArduPilot: corrected = ODI (raw + OFS) + MOT I, in mG
     offset = -compass.offset / mG
-    values = {f"COMPASS_OFS{n}_{axis}": offset[k] for k, axis in enumerate(AUTOPILOT_AXES)}
-    values |= {f"COMPASS_DIA{n}_{axis}": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
-    values |= {
-        f"COMPASS_ODI{n}_{axis}": compass.matrix[pair] for axis, pair in zip(AUTOPILOT_AXES, OFF, strict=True)
-    }
+    values = _by_axis(f"COMPASS_OFS{n}_{{}}", offset)
+    values |= _by_axis(f"COMPASS_DIA{n}_{{}}", np.diag(compass.matrix))
+    values |= _by_axis(f"COMPASS_ODI{n}_{{}}", compass.matrix[OFF])
     values[f"COMPASS_SCALE{n}"] = 1.0
     if compass.current is not None:
         # the current is compensated after the matrix
-        motor = -(compass.matrix @ compass.current) / mG
-        values |= {"COMPASS_MOTCT": 2.0} | {
-            f"COMPASS_MOT{n}_{axis}": motor[k] for k, axis in enumerate(AUTOPILOT_AXES)
-        }
-    text = "".join(f"{name},{float(value):.9g}\n" for name, value in values.items())
-    length = float(np.linalg.norm(offset))
-    long = [
-        f"offsets of {length:.0f} mG: ArduPilot does not arm beyond COMPASS_OFFS_MAX, {MAX_OFFSET_MG:.0f}"
-    ]
-    return text, long if length > MAX_OFFSET_MG else []
+        values["COMPASS_MOTCT"] = 2.0
+        values |= _by_axis(f"COMPASS_MOT{n}_{{}}", -(compass.matrix @ compass.current) / mG)
+    text = "".join(f"{name},{value:.9g}\n" for name, value in values.items())
+    if (length := float(np.linalg.norm(offset))) <= MAX_OFFSET_MG:
+        return text, []
+    limit = f"ArduPilot does not arm beyond COMPASS_OFFS_MAX, {MAX_OFFSET_MG:.0f}"
+    return text, [f"offsets of {length:.0f} mG: {limit}"]
 
 
 def px4(compass: Compass, number: int = 0) -> str:
     """Return the text of a QGroundControl parameter file for PX4's compass `number` (from 0)."""
     G = NT_PER_UNIT["G"]
     # PX4: corrected = SCALE (raw - OFF), in G; the current in kA
-    values = {f"CAL_MAG{number}_{axis}OFF": compass.offset[k] / G for k, axis in enumerate(AUTOPILOT_AXES)}
-    values |= {f"CAL_MAG{number}_{axis}SCALE": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
-    values |= {
-        f"CAL_MAG{number}_{axis}ODIAG": compass.matrix[pair]
-        for axis, pair in zip(AUTOPILOT_AXES, OFF, strict=True)
-    }
+    values = _by_axis(f"CAL_MAG{number}_{{}}OFF", compass.offset / G)
+    values |= _by_axis(f"CAL_MAG{number}_{{}}SCALE", np.diag(compass.matrix))
+    values |= _by_axis(f"CAL_MAG{number}_{{}}ODIAG", compass.matrix[OFF])
     lines = ["# Vehicle-Id Component-Id Name Value Type"]
     if compass.current is not None:
-        values |= {
-            f"CAL_MAG{number}_{axis}COMP": -1e3 * compass.current[k] / G
-            for k, axis in enumerate(AUTOPILOT_AXES)
-        }
+        values |= _by_axis(f"CAL_MAG{number}_{{}}COMP", -1e3 * compass.current / G)
         lines.append(f"1\t1\tCAL_MAG_COMP_TYP\t2\t{INTEGER}")
-    lines += [f"1\t1\t{name}\t{float(value):.9g}\t{FLOAT}" for name, value in values.items()]
+    lines += [f"1\t1\t{name}\t{value:.9g}\t{FLOAT}" for name, value in values.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -216,10 +209,7 @@ def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
 
 
 def _errors(calibration: Calibration, positions: FloatArray, dip_deg: float) -> FloatArray:
-    """Return heading errors, deg, at several headings and pitches, with masses at `positions` (k,).
-
-    The readings are corrected as if all masses were at the middle of their ranges.
-    """
+    """Return heading errors, deg, at several headings and pitches, with masses at `positions` (k,)."""
     pitch, psi = np.array(list(product(np.radians(PITCHES_DEG), np.radians(HEADINGS_DEG)))).T
     level = np.zeros(len(psi))
     dip = np.radians(dip_deg)
