@@ -239,13 +239,8 @@ def _base_flags(calibration: Calibration) -> int:
 
 def valid_ranges(calibration: Calibration) -> list[tuple[float, float]]:
     """Return the lowest and highest value of each parameter for which samples are not ``extrapolated``."""
-    return [
-        (
-            parameter.low - RANGE_MARGIN_FRACTION * parameter.scale,
-            parameter.high + RANGE_MARGIN_FRACTION * parameter.scale,
-        )
-        for parameter in calibration.parameters
-    ]
+    margins = ((one, RANGE_MARGIN_FRACTION * one.scale) for one in calibration.parameters)
+    return [(one.low - margin, one.high + margin) for one, margin in margins]
 
 
 # ---- Many samples at once ----
@@ -354,10 +349,7 @@ def _prepared_blocks(
 def _regressors(
     kernel: Kernel, steps: list[Step], field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return the regressors (m, n) of n samples, those of effects computed by their steppers `steps`.
-
-    `field` (n, 3): raw reading, nT. `channels` (n, k): telemetry. `time` (n,): s since 1970 UTC.
-    """
+    """Return the regressors (m, n) of n samples, those of effects computed by their steppers `steps`."""
     phi = kernel.monomials(list(channels.T), np.ones(len(field)))
     if steps:
         times = np.rint(np.asarray(time) * 1e6).astype(np.int64).tolist()
@@ -385,11 +377,7 @@ def regressors(
 
 
 def _prepare_many(kernel: Kernel, phi: FloatArray) -> Prepared:
-    """Return the input of :func:`.kernel.apply` for n samples' regressors (m, n).
-
-    If at most half of the samples differ from the previous one, it is computed once for each stretch of equal
-    samples.
-    """
+    """Return the input of :func:`.kernel.apply` for n samples' regressors (m, n)."""
     # At rest the regressors of successive samples are equal: prepare each stretch once, and repeat it.
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)

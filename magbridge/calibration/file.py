@@ -256,10 +256,7 @@ def _check_scalar(sensor: ScalarSensor) -> None:
 
 
 def _check_covariance(covariance: FloatArray, prefix: str = "") -> None:
-    """Raise CalibrationError unless a matrix is symmetric and positive semidefinite, up to rounding.
-
-    `prefix`: start of the message, which names the matrix.
-    """
+    """Raise CalibrationError, with `prefix`, unless a matrix is symmetric and positive semidefinite."""
     if np.abs(covariance).max(initial=0.0) > MAX_STATED_SIGMA**2:
         raise CalibrationError(f"{prefix}covariance: expected standard deviations up to {MAX_STATED_SIGMA:g}")
     # a correlation beyond 1 cannot be a covariance; the scale makes the test independent of units

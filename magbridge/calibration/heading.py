@@ -64,10 +64,7 @@ class Heading:
 
 
 def _level(b: Components, turn: Components) -> Components:
-    """Return the vector b in level axes, ``h = R_y(pitch) R_x(roll) b``.
-
-    `turn`: sine and cosine of roll, then of pitch. Arguments may be numbers (one sample) or arrays (a log).
-    """
+    """Return b in level axes, ``h = R_y(pitch) R_x(roll) b``; `turn`: sine and cosine of roll, then pitch."""
     (x, y, z), (sin_roll, cos_roll, sin_pitch, cos_pitch) = b, turn
     z_rolled = sin_roll * y + cos_roll * z
     return (
@@ -88,9 +85,7 @@ def _variance(
 ) -> Any:
     """Return the variance of the magnetic heading, rad^2, by the equations in the module's notes.
 
-    `b`, `h`: vector in body and in level axes, nT. `turn`: as for :func:`_level`. `covariance`, `boresight`:
-    V and Omega, nine entries each, row by row, nT^2 and rad^2. `added_variance`: further variance of each
-    axis, nT^2. `tilt_sigma`: 1-sigma of roll and of pitch, rad.
+    `b`, `h`: vector in body and in level axes, nT. `covariance`, `boresight`: V and Omega, nT^2 and rad^2.
     """
     (x, y, z), (h_x, h_y, h_z), (sin_roll, cos_roll, sin_pitch, cos_pitch) = b, h, turn
     horizontal_squared = h_x * h_x + h_y * h_y
@@ -111,12 +106,8 @@ def _variance(
 
 
 def _excess(b: Components, covariance: Components, boresight: Components, published: Any) -> Any:
-    """Return the variance of each axis, nT^2, that the bridge has added to the calibration's variance.
-
-    Checks and moving masses increase the published variances. The direction of this increase is unknown, so
-    each axis gets a third of it. `published`: sum of the three components' published variances, nT^2, of
-    which the calibration causes ``tr V + tr Omega |b|^2 - b^T Omega b``.
-    """
+    """Return the variance of each axis, nT^2, that checks and moving masses add to the calibration's."""
+    # its direction is unknown: each axis gets a third of what exceeds tr V + tr Omega |b|^2 - b^T Omega b
     trace = boresight[0] + boresight[4] + boresight[8]
     known = covariance[0] + covariance[4] + covariance[8] - _quadratic_form(boresight, b)
     return (published - known - trace * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2])) / 3.0

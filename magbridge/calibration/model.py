@@ -136,13 +136,12 @@ def _table(
     flat = (P @ B).reshape(len(P), -1)
     C = (flat.T @ calibration.covariance @ flat).reshape(m, 12, m, 12)
 
-    def key(i: int, j: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        powers = [np.array(exponents[r]) for r in (i, j) if r < len(exponents)]
-        return tuple(np.sum(powers, axis=0).astype(int)) if powers else (), tuple(
-            sorted(r for r in (i, j) if r >= len(exponents))
-        )
+    def key(i: int, j: int) -> tuple[tuple[int, ...], ...]:
+        powers = [exponents[r] for r in (i, j) if r < len(exponents)]
+        others = [r for r in (i, j) if r >= len(exponents)]
+        return tuple(map(sum, zip(*powers, strict=True))), tuple(others)
 
-    products: dict[tuple[tuple[int, ...], tuple[int, ...]], list[tuple[int, int]]] = {}
+    products: dict[tuple[tuple[int, ...], ...], list[tuple[int, int]]] = {}
     for i in range(m):
         for j in range(i, m):
             products.setdefault(key(i, j), []).append((i, j))
@@ -158,10 +157,7 @@ def _table(
 
 
 def _combinations(S: FloatArray) -> FloatArray:
-    """Return the 69 numbers that the table keeps of the covariance S (12, 12) of A' and T.
-
-    They are Q (V's six entries by the six products of d), ``S_a'T`` (9 x 3) and ``S_TT`` (6).
-    """
+    """Return Q (6 x 6), ``S_a'T`` (9 x 3) and ``S_TT`` (6) of the covariance S (12, 12) of A' and T."""
     Q = [
         S[3 * i + k, 3 * j + l] + (S[3 * i + l, 3 * j + k] if k != l else 0.0)
         for i, j in PAIRS

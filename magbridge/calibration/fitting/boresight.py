@@ -195,12 +195,11 @@ def boresight_from_tilt(
 
 
 def _tilt_variances(residuals: list[FloatArray], levers: list[FloatArray]) -> tuple[float, float]:
-    """Return the variances of the tilt's white noise and of its offset in a run, rad^2.
+    """Return the variances s^2 and sigma_t^2 of the module's notes, rad^2.
 
-    They are s^2 and sigma_t^2 of the module's notes. `residuals`: array (m,) of each run, rad. `levers`:
-    array (m, 2) of each run, the derivatives of its residuals by roll and by pitch.
+    `residuals`, `levers`: e (m,), rad, and T (m, 2) of each run.
     """
-    squares, eigenvalues, white = np.empty((0,)), np.empty((0,)), 0.0
+    squares, eigenvalues, white = np.empty(0), np.empty(0), 0.0
     for e, T in zip(residuals, levers, strict=True):
         of_run, axes = np.linalg.eigh(T.T @ T)
         of_run = np.maximum(of_run, MIN_SQUARED_LEVER)
@@ -330,11 +329,5 @@ def to_boresight(
 ) -> Boresight:
     """Return the boresight of a rotation; `covariance` (3, 3): rad^2; `tilt_sigma`: deg."""
     symmetric = 0.5 * (covariance + covariance.T)
-    return msgspec.convert(
-        {
-            "rotation": rotation.as_rotvec().tolist(),
-            "covariance": symmetric.tolist(),
-            "tilt_sigma": tilt_sigma,
-        },
-        Boresight,
-    )
+    settings = {"rotation": rotation.as_rotvec().tolist(), "covariance": symmetric.tolist()}
+    return msgspec.convert(settings | {"tilt_sigma": tilt_sigma}, Boresight)

@@ -53,14 +53,8 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnos
             continue  # the mass moved continuously
         if len(groups) <= min(order, 3):
             places = " and ".join(f"{np.median(g):.4g}" for g in groups)
-            yield Diagnostic(
-                "few_positions",
-                {
-                    "parameter": parameter.name,
-                    "positions": counted(len(groups), "position"),
-                    "places": f"{places} {parameter.unit}".rstrip(),
-                },
-            )
+            values = {"parameter": parameter.name, "positions": counted(len(groups), "position")}
+            yield Diagnostic("few_positions", values | {"places": f"{places} {parameter.unit}".rstrip()})
 
 
 def _moved_together(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
@@ -199,10 +193,7 @@ def judged(found: Fit, data: Observations) -> Fit:
 
 
 def _reasons(found: Fit, data: Observations, ratio: float, noise: float) -> Iterator[Diagnostic]:
-    """Yield reasons why the data do not support a fit.
-
-    `ratio`: expected error over the noise of a sample. `noise`: of a sample, nT.
-    """
+    """Yield reasons against a fit; `ratio`: expected error over the `noise` of a sample, nT."""
     # autocorrelation of the residual after the crustal field has been subtracted
     lasting = found.details.get("autocorrelation", 0.0)
     if lasting > MAX_NOISE_AUTOCORRELATION:

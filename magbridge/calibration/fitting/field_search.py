@@ -307,17 +307,6 @@ def climb(
     return replace(best, rho=rho, score=-float(found.fun))
 
 
-def refined(
-    sums_of: Callable[[GaussianField], SampleSums], place: FloatArray, choice: Choice, weighed: Weighed
-) -> Choice:
-    """Maximise the evidence from `choice`, on new nodes at `place` (n, 2), m, if its nodes do not suit it."""
-    field = choice.field
-    if not fine_enough(field.nodes, field.length, field.alpha):
-        nodes = nodes_for(place, field.length, field.alpha)
-        field = replace(field, nodes=nodes)
-    return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
-
-
 # ---- Uncertainty of amplitude and length ----
 
 MAX_UNCERTAIN_NODES = 2_500

@@ -97,9 +97,8 @@ def fit(
     expect("data", data, Observations, "magbridge.observations(log)")
     if method not in METHODS:
         raise CalibrationError(f"method: {one_of(str(method), METHODS)}")
-    _check_options(
-        method, {"order": order, **options, **({"site_bias": site_bias} if site_bias is not None else {})}
-    )
+    given = {} if site_bias is None else {"site_bias": site_bias}
+    _check_options(method, {"order": order, **options, **given})
     # without a true field, try the survey fit where the track separates the crustal field from the vehicle
     bias = _default_bias(data) if site_bias is None else site_bias
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
@@ -151,12 +150,9 @@ def _check_options(method: str, options: dict[str, Any]) -> None:
 def _first_solution(
     data: Observations, method: str, order: int, bias: float, in_place: bool, options: dict[str, Any]
 ) -> tuple[Fit, str, tuple[Diagnostic, ...]]:
-    """Return the fit of the first method with a solution, this method's name, and notes on the choice.
+    """Return the fit of the first method with a solution, its name, and why others were not used.
 
-    The notes state why the first choice was not used. `bias`: 1-sigma of the reference's constant bias, nT.
-    `in_place`: True if ``survey`` is the first choice.
-
-    CalibrationError: no method has a solution; the message is that of the first method.
+    `in_place`: True if ``survey`` is the first choice. CalibrationError: no method has a solution.
     """
     # each attempt: method, data, options, and the notes that explain why it is not the first choice
     bare = data.without_parameters()
@@ -202,10 +198,7 @@ def _function(method: str) -> Callable[..., Fit]:
 
 
 def _rock_may_show(data: Observations, order: int) -> bool:
-    """Return True if the residual of a fit without a crustal field is small enough to be crustal field.
-
-    The result is also True if this fit has no solution.
-    """
+    """Return True if a fit without crustal field leaves a residual of a crust's size, or has no solution."""
     few = data.thinned(CRUST_TEST_SAMPLES)
     for method in ("nominal", "auto"):
         try:
@@ -225,10 +218,7 @@ def _default_bias(data: Observations) -> float:
 
 
 def _biased(found: Fit, sigma: float) -> Fit:
-    """Return the fit with its covariance enlarged by an unknown bias of the reference, of 1-sigma `sigma` nT.
-
-    A bias dF changes A by ``A dF / F`` at all positions.
-    """
+    """Return the fit with its covariance enlarged by a bias of the reference, of 1-sigma `sigma`, nT."""
     if not sigma:
         return found
     calibration = found.calibration

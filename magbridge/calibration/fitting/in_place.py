@@ -43,14 +43,7 @@ from magbridge.calibration.fitting.left_out import leave_out
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import Known, Vehicle, pose
 from magbridge.calibration.fitting.result import Creep, Fit, assemble
-from magbridge.calibration.fitting.rounds import (
-    FIRST_SAMPLES,
-    SEARCHED,
-    WIDE,
-    Answer,
-    Rounds,
-    SurveySamples,
-)
+from magbridge.calibration.fitting.rounds import FIRST_SAMPLES, SEARCHED, WIDE, Answer, Rounds, SurveySamples
 from magbridge.calibration.fitting.solve import CoefficientPosterior, check_scales
 from magbridge.calibration.fitting.uncertainty import contradicts, with_level
 from magbridge.calibration.model import Calibration
@@ -96,7 +89,7 @@ def fit_in_place(
     # offset terms, drift of the track, and the crustal field, which each iteration eliminates.
     posed = pose(data, order, vehicle, known)
     samples, q = posed.samples, posed.family.E.shape[1]
-    groups = (*_groups(data, level), *offered(data))
+    groups = (*_groups(data, level), *_offered(data))
     # a drift of positions is a random walk
     waves = SlowFunctions(data.time, DRIFTING)
     moves = position_sigma > 0.0 and len(waves.shape) > 0
@@ -123,7 +116,7 @@ def fit_in_place(
     # held-out errors, with the estimated crustal field: the choice of parameters compares them
     details = {**_details(found, survey), "left_out_nT": leave_out(posterior, data.runs).rms}
     fit = assemble(data, posed, posterior, "survey", details=details, informative=True)
-    calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
+    calibration = _with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
     if level:
         calibration = with_level(calibration, lifted, float(z[q]), level)
     unclear = [*left_open(data.unmapped_place, found.choice.field.length)]
@@ -132,8 +125,11 @@ def fit_in_place(
     fit = replace(fit, calibration=calibration, open=tuple(unclear))
     if not creep.any():
         return fit
+    # after the survey the offset may be any of its values during the survey: add their variance to that of T
+    wider = calibration.covariance.copy()
+    wider[6:9, 6:9] += creep.T @ creep / len(creep)
     return replace(
-        fit, calibration=with_creep(calibration, creep), creep=Creep(data.time, creep, calibration)
+        fit, calibration=replace(calibration, covariance=wider), creep=Creep(data.time, creep, calibration)
     )
 
 
@@ -143,27 +139,23 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
     # the bias has the 1-sigma `level`, and changes by as much over 25 km
     away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REFERENCE_ERROR_LENGTH_M
     level = max(level, 1e-3)
-    groups = [ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)]
-    groups.append(ParameterBlock("gradient", away, np.ones(3), level))
+    bias = ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)
+    gradient = ParameterBlock("gradient", away, np.ones(3), level)
     waves = SlowFunctions(data.time)
-    if len(waves.shape):
-        groups.append(
-            ParameterBlock("slow change with time", waves, waves.shape, SLOW, SLOW_SPREAD, offered=True)
-        )
-    return tuple(groups)
+    slow = ParameterBlock("slow change with time", waves, waves.shape, SLOW, SLOW_SPREAD, offered=True)
+    return (bias, gradient, slow) if len(waves.shape) else (bias, gradient)
 
 
 def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, SurveySamples]:
-    """Return the converged fit, and its samples with the selected optional terms.
-
-    A long log converges with every second or tenth sample first, and then with all.
-    """
+    """Return the converged fit, and its samples with the selected optional terms."""
+    # a long log converges with every second or tenth sample first, and then with all
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), family)
     answer = best.settle()
     if step == 1:
         return answer, best.survey
-    survey.keep(tuple(group for group in survey.groups if group.name in best.names))
+    names = {group.name for group in best.survey.groups}
+    survey.keep(tuple(group for group in survey.groups if group.name in names))
     best.go_on(survey, step)
     return best.settle(), survey
 
@@ -202,7 +194,7 @@ PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 (nT) along an axis, and 1-sigma of their logarithms."""
 
 
-def offered(data: Observations) -> tuple[OffsetBlock, ...]:
+def _offered(data: Observations) -> tuple[OffsetBlock, ...]:
     """Return the optional offset terms that a log allows: the temperature at each lag, and drift."""
     groups = []
     if data.temperature is not None and TEMPERATURE not in data.names:
@@ -210,11 +202,9 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
             # a constant temperature cannot be separated from the offset
             warm = _temperature(data, lag)
             if np.std(warm) > VARIES:
-                column = (warm - warm.mean())[:, None]
-                name = f"offset by temperature, lag {lag:.0f} s"
-                groups.append(
-                    OffsetBlock(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag)
-                )
+                name, column = f"offset by temperature, lag {lag:.0f} s", (warm - warm.mean())[:, None]
+                block = OffsetBlock(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag)
+                groups.append(block)
     # a random walk of the offset, by slow functions of time on each axis
     waves = SlowFunctions(data.time, SHORTEST_DRIFT_HALF_PERIOD_S)
     if len(waves.shape):
@@ -230,7 +220,7 @@ def _temperature(data: Observations, lag: float) -> FloatArray:
     return lagged(data.time, held(data.temperature, float(known.mean()) if len(known) else 0.0), lag)
 
 
-def with_temperature(
+def _with_temperature(
     calibration: Calibration,
     data: Observations,
     groups: tuple[ParameterBlock, ...],
@@ -238,8 +228,7 @@ def with_temperature(
 ) -> Calibration:
     """Return the calibration with the temperature term of the fit as an effect, if the fit kept one.
 
-    `groups`: blocks of the fit, in order. `found`: unknowns z (q,), their covariance (q, q), and the matrix E
-    (K, q) from z to the coefficients.
+    `found`: unknowns z (q,), their covariance (q, q), and the matrix E (K, q) from z to the coefficients.
     """
     # The temperature term becomes a channel effect with three more coefficients, which are three of z, with
     # their covariance with all other coefficients.
@@ -257,11 +246,3 @@ def with_temperature(
             )
         row += len(one.shape)
     return calibration
-
-
-def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
-    """Return the calibration with the variance of the survey's offsets (n, 3), nT, added to that of T."""
-    covariance = calibration.covariance.copy()
-    # after the survey the offset may be any of its values during the survey: add their variance to that of T
-    covariance[6:9, 6:9] += creep.T @ creep / len(creep)
-    return replace(calibration, covariance=covariance)

@@ -125,10 +125,8 @@ def _forward(parts: list[IndexArray]) -> list[Split]:
 def _predicted(
     found: CoefficientPosterior, parts: list[IndexArray], splits: list[Split]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors (m,), nT, of all splits by linearised predictions, and their variances (m,), nT².
-
-    Both are in the units of a sample at rest: samples next to a motion have a larger variance.
-    """
+    """Return the errors (m,), nT, of all splits by linearised predictions, and their variances (m,), nT²."""
+    # both in the units of a sample at rest: samples next to a motion have a larger variance
     samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
     c, weight = found.coefficients, found.weighted.weight
     # Normal equations are sums over samples, so one Newton step from the common fit gives the coefficients of
@@ -176,10 +174,7 @@ def _refitted_error(found: CoefficientPosterior, parts: list[IndexArray], splits
 
 
 def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
-    """Return RMS and ratio of errors e (n,), nT, with predicted variances s2 (n,), nT².
-
-    `count`: number of independent errors.
-    """
+    """Return RMS and ratio of `count` independent errors e (n,), nT, of the variances s2 (n,), nT²."""
     ratio2 = 1.0
     for _ in range(20):  # an outlier counts as an error at the limit, which grows with the ratio
         last, limit = ratio2, OUTLIER_SIGMA**2 * ratio2
@@ -193,10 +188,8 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
 
 
 def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
-    """Return the rows of each part: one or several runs, or a block of successive samples.
-
-    Parts are blocks if the log has fewer than three runs, or one run is more than half of it.
-    """
+    """Return the rows of each part: one or several runs, or a block of successive samples."""
+    # blocks if the log has fewer than three runs, or one run is more than half of it
     _, first, label, count = np.unique(runs, return_index=True, return_inverse=True, return_counts=True)
     if len(first) < 3 or count.max() > len(runs) / 2:
         return np.array_split(np.arange(len(runs)), BLOCKS)

@@ -46,13 +46,13 @@ from magbridge.calibration.fitting.solve import (
     check_scales,
     flown,
     lasting_noise,
+    noise_of_residuals,
     settle,
     starts,
     with_slow_noise,
 )
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, estimate_noise
-from magbridge.estimation.optimise import Solution
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
 from magbridge.estimation.residual import ResidualSamples, residuals_of
 
@@ -104,31 +104,23 @@ def fit_auto(
 
 
 def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
-    """Return the fit of one ellipsoid if it predicts held-out parts better than `found`, else None.
-
-    The comparison uses the geometric mean of two error ratios: of parts predicted from all other parts, and
-    of later parts predicted from the earlier parts. If the reference is nearly constant, such errors favour a
-    collapsed fit. The ellipsoid is therefore rejected if its scales are implausible, and farther from 1 than
-    those of `found`.
-    """
+    """Return the fit of one ellipsoid if it predicts held-out parts better than `found`, else None."""
     try:
         posed, one, left = ellipsoid(data)
     except CalibrationError:
         return None
-    forward = error_forward(one) / found.details["forward_nT"]
     simpler = _nominal(data, posed, one, left)
-    simpler.details["forward_nT"] = forward * found.details["forward_nT"]
-    simpler.details["flown"] = found.details["flown"]
-    if data.names:  # errors to first order suffice to compare fits that differ by their parameters
+    simpler.details.update(forward_nT=error_forward(one), flown=found.details["flown"])
+    # geometric mean of two error ratios: of later parts predicted from the earlier ones, and of parts
+    # predicted from all others; for the latter, errors to first order suffice if the parameters differ
+    forward = simpler.details["forward_nT"] / found.details["forward_nT"]
+    if data.names:
         among = left.rms / found.details["left_out_nT"]
         return simpler if among * forward < 1.0 else None
     among = error_between(one, data.runs) / error_between(best, data.runs)
-    return simpler if among * forward < 1.0 and _shrinks(simpler) <= max(_shrinks(found), SHRUNK) else None
-
-
-def _shrinks(found: Fit) -> float:
-    """Return the departure of the middle scale factor of A from 1."""
-    return abs(0.5 * sum(found.scales) - 1.0)
+    # with a nearly constant reference such errors favour a collapsed fit, so compare the middle scales too
+    shrinks, before = (abs(0.5 * sum(one.scales) - 1.0) for one in (simpler, found))
+    return simpler if among * forward < 1.0 and shrinks <= max(before, SHRUNK) else None
 
 
 # ---- One ellipsoid ----
@@ -217,10 +209,7 @@ def ellipsoid(
 def _settled(
     samples: ResidualSamples, prior: Prior, start_z: FloatArray | None = None
 ) -> CoefficientPosterior:
-    """Return the posterior of one ellipsoid with a prior, from `start_z` (q,), else the better of two starts.
-
-    NoSolutionError: the fit collapsed or did not converge.
-    """
+    """Return the posterior of one ellipsoid, from `start_z` (q,), else the better of two starts."""
     begun = [np.asarray(np.linalg.lstsq(prior.E, start, rcond=None)[0], float) for start in starts(samples)]
     wide = NoiseModel(1e-3 * samples.F_0)  # residuals are not noise yet
     best: CoefficientPosterior | None = None
@@ -238,11 +227,8 @@ def _settled(
 
 
 def _precision(E: FloatArray, factor: float) -> FloatArray:
-    """Return the prior precision (q, q) of z in ``c = E z``, for coefficients c as fractions of the field.
-
-    `E` (9, q): constraints. `factor`: of the prior widths of soft iron and of the common gain.
-    """
-    # independent soft iron and hard iron, plus a gain that is common to the three axes
+    """Return the prior precision (q, q) of z in ``c = E z``, for coefficients c as fractions of the field."""
+    # soft iron and hard iron, plus a gain common to the axes; `factor` widens soft iron and gain
     covariance = np.diag(np.array([factor * SOFT_IRON_SIGMA] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += (factor * GAIN_SIGMA) ** 2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
@@ -268,7 +254,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
         start[:9] = ellipsoid(data, constrained=True)[1].coefficients
     # white noise: infinite steps; the coefficients take at most half of the degrees of freedom
     alone = replace(samples, steps=np.full(len(data), np.inf))
-    noise_of = partial(_noise_of, alone, min(float(size), len(data) / 2))
+    noise_of = partial(noise_of_residuals, alone, min(float(size), len(data) / 2))
     wide = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
     prior = Prior(np.eye(size) / FREE_SIGMA_NT**2, np.eye(size))
     found = settle(samples, prior, start, noise_of, wide, rounds=2, steps=200)
@@ -276,17 +262,6 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     # report residuals in the sensor's units; A is near I, so the sensor's noise is the magnitude's
     as_magnitude = NoiseModel(found.noise.sigma * REFERENCE_NOISE_RATIO)
     return assemble(data, posed, replace(found, samples=posed.samples, noise=as_magnitude), "cubic")
-
-
-def _noise_of(
-    samples: ResidualSamples, free: float, prior: Prior, found: Solution, _: NoiseModel
-) -> tuple[NoiseModel, NoiseModel]:
-    """Return the noise of a fit's residuals twice: of a sample, and for weighting.
-
-    `free`: number of parameters that the fit determines.
-    """
-    noise = estimate_noise(residuals_of(samples, prior.coefficients(found.z)), samples.steps, free)
-    return noise, noise
 
 
 # ---- An ellipsoid for each run, then polynomials through them ----
@@ -320,9 +295,8 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         if rows.sum() < MIN_RUN_SAMPLES:
             continue
         part = single.samples.part(rows)
-        found = settle(
-            part, prior, np.zeros(9), partial(_noise_of, part, 5.0), NoiseModel(one.noise.sigma), rounds=3
-        )
+        noise_of = partial(noise_of_residuals, part, 5.0)
+        found = settle(part, prior, np.zeros(9), noise_of, NoiseModel(one.noise.sigma), rounds=3)
         L = np.linalg.cholesky(np.linalg.inv(found.spread))
         rows_of_runs.append(np.kron(typical, L.T))
         values.append(L.T @ found.coefficients)

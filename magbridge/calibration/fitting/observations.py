@@ -30,10 +30,6 @@ _PER_SAMPLE = (
 )  # fmt: skip
 
 
-def _nothing() -> FloatArray:
-    return np.empty(0)
-
-
 @dataclass(frozen=True, eq=False)
 class Observations:
     """Calibration data as arrays.
@@ -50,10 +46,10 @@ class Observations:
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     """`names`, `units`: Name and unit of each parameter."""
-    runs: NDArray[np.generic] = attribute(default_factory=_nothing)
+    runs: NDArray[np.generic] = attribute(default_factory=lambda: np.empty(0))
     """(n,): Label of each sample's run: a dive, spiral or file; default: one run. Cross-validation holds out
     whole runs."""
-    time: FloatArray = attribute(default_factory=_nothing)
+    time: FloatArray = attribute(default_factory=lambda: np.empty(0))
     """(n,): Time of the samples, s since 1970 UTC; default: one sample per second."""
     attitude: FloatArray | None = None
     """(n, 3): Roll, pitch and true heading, rad; NaN where unknown."""
@@ -252,10 +248,7 @@ def _enough(
     names: Sequence[str],
     reference: FloatArray,
 ) -> None:
-    """Raise CalibrationError if fewer than 10 of n samples are `complete` (n,), or a reference is <= 0.
-
-    The message names the columns that lack values.
-    """
+    """Raise CalibrationError if fewer than 10 of n samples are `complete` (n,), or a reference is <= 0."""
     if complete.sum() >= 10:
         if not (reference[complete] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
@@ -277,10 +270,7 @@ def _enough(
 
 
 def _plausible(names: Sequence[str], positions: FloatArray) -> None:
-    """Raise CalibrationError if a position is far from all others, such as an undeclared missing-value code.
-
-    `positions` (n, k): one column for each of `names`.
-    """
+    """Raise CalibrationError if a position is far from all others, such as a missing-value code."""
     for name, column in zip(names, positions.T, strict=True):
         # the span of 99 % of the positions is the scale: a code such as -999 lies many spans away
         low, middle, high = np.quantile(column, [COMMON, 0.5, 1.0 - COMMON])

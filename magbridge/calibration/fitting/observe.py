@@ -15,13 +15,7 @@ from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, require
 from magbridge.datasets import standard_log
 from magbridge.errors import CalibrationError, WrongUse
 from magbridge.field.geodesy import separation
-from magbridge.field.reference import (
-    earth_field,
-    placed,
-    positions,
-    variation_level_sigma,
-    with_true_heading,
-)
+from magbridge.field.reference import earth_field, placed, positions, variation_level_sigma, with_true_heading
 from magbridge.one_time import interpolate_to_rows
 
 if TYPE_CHECKING:
@@ -83,9 +77,7 @@ def observations(
     return Observations(
         field=np.stack([columns[name] for name in CHANNELS], axis=1),
         reference=total,
-        parameters=np.stack([columns[name] for name in parameters], axis=1)
-        if parameters
-        else np.empty((len(time), 0)),
+        parameters=np.array([columns[name] for name in parameters]).reshape(len(parameters), len(time)).T,
         names=parameters,
         units=tuple(str(ds[name].attrs.get("units", "")) for name in parameters),
         runs=_runs(ds, time),
@@ -164,8 +156,5 @@ def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
             return np.asarray(ds[name].values)
     # a long gap separates runs: noise and attitude errors are independent across it
     step = np.diff(time, prepend=time[:1])
-    return (
-        np.cumsum(step > MIN_GAP_INTERVALS * np.median(step[1:]))
-        if len(time) > 1
-        else np.zeros(len(time), int)
-    )
+    usual = np.median(step[1:]) if len(time) > 1 else np.inf
+    return np.cumsum(step > MIN_GAP_INTERVALS * usual)

@@ -223,11 +223,9 @@ def _offer(name: str, further: Fit | None, found: Fit, *, taken: bool) -> Offer:
 
 
 def _predicts_better(further: Fit, found: Fit) -> bool:
-    """Return True if further columns improve the prediction of held-out and of later parts of the log.
-
-    Later parts may be predicted worse if they have positions of a mass that earlier parts lack. They count
-    less if the error of held-out parts falls by a far larger factor.
-    """
+    """Return True if further columns improve the prediction of held-out and of later parts of the log."""
+    # later parts may have positions of a mass that earlier parts lack: their error may grow if that of
+    # held-out parts falls by a far larger factor
     known = {"left_out_nT", "forward_nT"} & found.details.keys() & further.details.keys()
     ratios = {name: further.details[name] / found.details[name] for name in known}
     left_out, forward = ratios["left_out_nT"], ratios.get("forward_nT", 0.0)
@@ -237,12 +235,8 @@ def _predicts_better(further: Fit, found: Fit) -> bool:
 
 def _is_distorted(further: Fit, found: Fit) -> bool:
     """Return True if further columns, which correlate with the attitude, have taken up part of the scales."""
-    return _departure(further) > max(_departure(found), USUAL_DEPARTURE)
-
-
-def _departure(found: Fit) -> float:
-    """Return the largest departure of a scale factor of A from 1."""
-    return max(abs(scale - 1.0) for scale in found.scales)
+    departure, before = (max(abs(scale - 1.0) for scale in one.scales) for one in (further, found))
+    return departure > max(before, USUAL_DEPARTURE)
 
 
 def lines(offers: Sequence[Offer]) -> list[str]:

@@ -17,10 +17,10 @@ from magbridge.calibration.fitting.field_search import (
     about_the_middle,
     choose,
     climb,
+    fine_enough,
     first_guess,
     ladder,
     nodes_for,
-    refined,
 )
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.solve import approach, starts
@@ -63,10 +63,8 @@ class Answer:
 
     z: FloatArray
     """(q,): Unknowns other than the field: coefficients, and those of the blocks."""
-    w: FloatArray
-    """(nodes,): Coefficients of the crustal field."""
     sums: SampleSums
-    """Normal equations from which z and w follow."""
+    """Normal equations from which z follows."""
     choice: Choice
     """Chosen field and autocorrelation of the noise."""
     widths: Hyperparameters
@@ -144,11 +142,6 @@ class Rounds:
         self.nodes = self.choice.field.nodes
         self.last: FloatArray | None = None
 
-    @property
-    def names(self) -> set[str]:
-        """Names of the blocks of unknowns in the fit."""
-        return {group.name for group in self.survey.groups}
-
     def go_on(self, survey: SurveySamples, step: int) -> None:
         """Continue with all samples, `survey`, and no search, after a fit of every `step`-th sample."""
         self.survey, self.until = survey, -1
@@ -197,10 +190,8 @@ class Rounds:
         if searched and self.step > 1:
             # size and length were chosen with a part of the samples
             self.choice = climb(sums, self.choice, weighed, **NOISE_ALONE)
-        choice, reduced = (
-            self.choice,
-            eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho),
-        )
+        choice = self.choice
+        reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
         # 2. widths of the priors, and sigma, by the evidence of the eliminated problem
         widths = maximise_evidence(reduced.quadratic, self.family, self.eta, self.sigma)
         self.eta, self.sigma = widths.eta, widths.sigma
@@ -214,25 +205,20 @@ class Rounds:
             self.survey.bend(choice.field, self.w, self.z[self.q :])
             lacking = self._slow(self.z) + self.survey.rock(choice.field, self.w)
         score = widths.log_evidence + reduced.log_evidence
-        return Answer(self.z, self.w, sums, choice, widths, self.family, lacking, score)
+        return Answer(self.z, sums, choice, widths, self.family, lacking, score)
 
     def _search(self, weighed: Weighed, *, anew: bool) -> None:
-        """Choose the field with a part of the samples, and set it up on nodes around all samples.
-
-        `anew`: search over all lengths instead of from the last choice.
-        """
+        """Choose the field with a part of the samples, and set it up on nodes around all samples."""
         place, before = self.survey.place[self.part], self.choice
         # first over a ladder of lengths, later from the last choice
         if anew:
             found = choose(self._few, place, weighed, before.ratio, deeper=self.survey.deeper[self.part])
         else:
-            begin = replace(before, rho=before.rho**self.step)
-            if not self.part.all():
-                field = before.field
-                begin = replace(
-                    begin, field=replace(field, nodes=nodes_for(place, field.length, field.alpha))
-                )
-            found = refined(self._few, place, begin, weighed)
+            field = before.field
+            if not self.part.all() or not fine_enough(field.nodes, field.length, field.alpha):
+                field = replace(field, nodes=nodes_for(place, field.length, field.alpha))
+            begin = replace(before, field=field, rho=before.rho**self.step)
+            found = climb(self._few(field), begin, weighed, steps=30)
         self.choice = self._everywhere(replace(found, rho=found.rho ** (1.0 / self.step)))
 
     def _everywhere(self, choice: Choice) -> Choice:
@@ -244,11 +230,7 @@ class Rounds:
         return replace(choice, field=replace(field, nodes=nodes))
 
     def _weigh_offers(self, turn: int) -> None:
-        """Keep the optional terms that the evidence supports, and remove the others from the fit.
-
-        The solver calls this after the iterations have converged with all terms, because before the terms fit
-        outliers. `turn`: number of the iteration.
-        """
+        """Keep the optional terms that the evidence supports; before convergence they fit outliers."""
         survey, choice = self.survey, self.choice
         self.offers = False
         reduced = eliminate_field(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
@@ -300,11 +282,8 @@ class Rounds:
         return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
 
     def _sums(self, field: GaussianField, rows: IndexArray | None = None, step: int = 1) -> SampleSums:
-        """Return the normal equations of all samples or of `rows`, linearised about the last solution.
-
-        `step`: spacing of `rows` in samples. If the field has new nodes, the linearisation is about a field
-        of 0.
-        """
+        """Return the normal equations of `rows`, a `step` apart, linearised about the last solution."""
+        # on new nodes the linearisation is about a field of 0
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
         rows = np.flatnonzero(self.survey.kept) if rows is None else rows
@@ -377,10 +356,7 @@ class SurveySamples:
         self.slopes = np.zeros((len(self.kept), 2 * many))
 
     def slow(self, latent: FloatArray) -> FloatArray:
-        """Return the constant bias and slow changes that the reference lacks, (n,), nT.
-
-        `latent` (p,): unknowns of all blocks.
-        """
+        """Return the bias and slow changes (n,), nT, that the reference lacks, of all unknowns (p,)."""
         return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
     def offset(self, latent: FloatArray, blocks: Sequence[OffsetBlock] | None = None) -> FloatArray:

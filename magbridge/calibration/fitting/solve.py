@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -132,16 +133,21 @@ def settle(
 def approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> CoefficientPosterior:
     """Return an approximate posterior after steps from z (q,); the bulk of the residuals sets the noise."""
     # far from the solution a small noise would make steps that overshoot
-    white = np.full(len(samples.field), np.inf)
+    white = replace(samples, steps=np.full(len(samples.field), np.inf))
+    bulk = estimate_noise(residuals_of(samples, prior.coefficients(z)), white.steps, 0.0)
+    estimate = partial(noise_of_residuals, white, 0.0)
+    return settle(samples, prior, z, estimate, bulk, change=MIN_APPROACH, steps=1, tolerance=0.1)
 
-    def bulk(z: FloatArray) -> NoiseModel:
-        return estimate_noise(residuals_of(samples, prior.coefficients(z)), white, 0.0)
 
-    def estimate(_: Prior, found: Solution, __: NoiseModel) -> tuple[NoiseModel, NoiseModel]:
-        noise = bulk(found.z)
-        return noise, noise
+def noise_of_residuals(
+    samples: ResidualSamples, free: float, prior: Prior, found: Solution, _: NoiseModel
+) -> tuple[NoiseModel, NoiseModel]:
+    """Return the noise of a fit's residuals twice: of a sample, and for weighting.
 
-    return settle(samples, prior, z, estimate, bulk(z), change=MIN_APPROACH, steps=1, tolerance=0.1)
+    `free`: number of parameters that the fit determines.
+    """
+    noise = estimate_noise(residuals_of(samples, prior.coefficients(found.z)), samples.steps, free)
+    return noise, noise
 
 
 def lasting_noise(
@@ -231,11 +237,8 @@ def climb(
 
 
 def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
-    """Return the log evidence of all samples.
-
-    An outlier counts as a sample at the outlier limit. The Jacobians of the whitening and of the weights are
-    included.
-    """
+    """Return the log evidence of all samples, with the Jacobians of the whitening and of the weights."""
+    # an outlier counts as a sample at the outlier limit
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
     variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
     whitening = 0.5 * np.log(variance).sum()

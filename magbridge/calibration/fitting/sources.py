@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -99,10 +100,5 @@ def _moving(data: Observations) -> Observations:
     """Return the data without the parameters that are constant in them."""
     span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
     moves = span > 1e-9 * np.abs(data.parameters).max(axis=0, initial=0.0)
-    pick = np.flatnonzero(moves).tolist()
-    return replace(
-        data,
-        parameters=data.parameters[:, moves],
-        names=tuple(data.names[i] for i in pick),
-        units=tuple(data.units[i] for i in pick),
-    )
+    names, units = (tuple(compress(one, moves)) for one in (data.names, data.units))
+    return replace(data, parameters=data.parameters[:, moves], names=names, units=units)

@@ -68,10 +68,7 @@ def _level_direction(calibration: Calibration, samples: ResidualSamples) -> tupl
 def _without_bias(
     calibration: Calibration, direction: FloatArray, sigma: float, bias: float, bias_sigma: float
 ) -> tuple[Calibration, FloatArray, float]:
-    """Return the calibration for a bias of 0 with its prior's sigma, and the new level's direction and sigma.
-
-    `direction` (K,), `sigma`: from :func:`_level_direction`. `bias`, `bias_sigma`: as for :func:`with_level`.
-    """
+    """Return the calibration for a bias of 0 with its prior sigma, and the level's direction and sigma."""
     # a step of `direction` changes the mean of the corrected field by `sigma`
     factor = max(bias_sigma / sigma, 1.0)
     moved = replace(

@@ -107,10 +107,8 @@ def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray
     scale = [parameter.scale for parameter in parameters]
     # A sample is at rest if no mass moved before or after it.
     moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > MAX_REST_FRACTION).any(axis=1)
-    at_rest = np.ones(len(data), bool)
-    at_rest[1:] &= ~moving
-    at_rest[:-1] &= ~moving
-    return data.parameters[at_rest]
+    at_rest = ~(np.append(False, moving) | np.append(moving, False))
+    return np.asarray(data.parameters[at_rest])
 
 
 def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
@@ -119,8 +117,10 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
     rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
     found = []
     for positions in product(*(np.linspace(one.low, one.high, levels) for one in parameters)):
-        if limits.flown is not None and not _is_near_flown(np.array(positions), limits.flown, parameters):
-            continue
+        if limits.flown is not None:
+            off = np.abs(positions - limits.flown) / [parameter.scale for parameter in parameters]
+            if not (off.max(axis=1) <= MAX_POSITION_DIFFERENCE).any():
+                continue
         if limits.pitch_at is None:
             steep = np.linspace(*limits.pitch, 3)
             pitches = [*(-steep), *steep]
@@ -134,12 +134,6 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
             if limits.pitch[0] <= abs(pitch) <= limits.pitch[1]
         ]
     return found
-
-
-def _is_near_flown(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
-    """Return True if one of the `flown` positions (m, k) is near `positions` (k,) in all parameters."""
-    off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
-    return bool((off.max(axis=1) <= MAX_POSITION_DIFFERENCE).any())
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ flown.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -124,10 +124,7 @@ def propose(
 def _patterns(
     n: int, interval: float, speed: float, roll: float
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield name, course (n,) and bank (n,), rad, of every pattern of n samples.
-
-    `interval`: time between samples, s. `speed`: m/s. `roll`: bank of banked legs, deg.
-    """
+    """Yield name, course (n,) and bank (n,), rad, of every pattern of n samples, an `interval` (s) apart."""
     # Fraction of the survey at each sample; `level` flight has no bank.
     share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
     bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
@@ -149,10 +146,7 @@ def _patterns(
 
 
 def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
-    """Return courses (n,), rad, along `count` parallel lines, at fractions `share` (n,) of the track.
-
-    `length`: length of the whole track, m.
-    """
+    """Return courses (n,), rad, along parallel lines, at fractions `share` (n,) of a track of `length` m."""
     # fraction of a line's part of the track that leads to the next line
     aside = min(0.1, 0.5 * LENGTH * count / max(length, 1.0))
     part = share * count
@@ -163,11 +157,7 @@ def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
 def _expected(
     design: Design, attitude: FloatArray, place: FloatArray, positions: FloatArray, noise: float
 ) -> tuple[float, float]:
-    """Return RMS and largest 1-sigma of the corrected field over the mission, nT, after a survey.
-
-    Both are relative to the field's mean over the mission. `attitude` (n, 3): roll, pitch, heading, rad.
-    `place` (n, 2): track, m. `positions` (n, k): in the parameters' units. `noise`: of a sample, nT.
-    """
+    """Return RMS and largest 1-sigma of the corrected field about its mean over the mission, nT."""
     calibration = design.calibration
     truth = field_body(attitude, np.tile(design.field_ned, (len(attitude), 1)))
     phi, g = design.derivative(truth, positions)
@@ -189,18 +179,8 @@ def _expected(
 
 def facts(found: list[Proposal]) -> dict[str, Any]:
     """Return the proposals as values for JSON."""
-    return {
-        "surveys": [
-            {
-                "pattern": one.name,
-                "expected_rms_nT": one.rms,
-                "expected_worst_nT": one.worst,
-                "places_met_again": one.crossings,
-                "open": one.open,
-            }
-            for one in found
-        ]
-    }
+    keys = "pattern", "expected_rms_nT", "expected_worst_nT", "places_met_again", "open"
+    return {"surveys": [dict(zip(keys, astuple(one), strict=True)) for one in found]}
 
 
 def summary(found: list[Proposal]) -> str:
