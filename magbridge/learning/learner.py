@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isnan
+from math import hypot, isnan
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -176,6 +176,7 @@ class Learner:
 
     def _begin(self, nuisance: Nuisance) -> None:
         """Reset learning, so that it starts with the first calibration."""
+        self._unlearned = 0.0  # size of a change that ended without a cause and may last, nT
         self._restart(nuisance)
         self._intake = Intake(self._max_rate)
         self.samples = 0
@@ -184,7 +185,7 @@ class Learner:
         self._refuted = False  # another alarm came before later samples confirmed the cause
 
     def _restart(self, nuisance: Nuisance) -> None:
-        """Restart learning with the published calibration, whose offsets may have changed at power-on."""
+        """Restart learning with the published calibration, whose offsets may have changed since."""
         published = self.calibration
         # without the map, the reference is off by the crustal field and its level
         mapless = (
@@ -192,7 +193,9 @@ class Learner:
             if self._grid is not None
             else None
         )
-        self._knowledge = Knowledge(self._model, published, nuisance, mapless, self._turn_on)
+        self._knowledge = Knowledge(
+            self._model, published, nuisance, mapless, hypot(self._turn_on, self._unlearned)
+        )
 
     def _notify(self, text: str, grave: bool = False) -> None:
         """Add a notification, which is a warning if it is `grave`."""
@@ -302,7 +305,7 @@ class Learner:
     def _publish(self, how: str) -> None:
         """Publish the learned calibration; `how` is the reason in the notification."""
         self._notify(self._publication.publish(self.learned(), how))
-        self._unconfirmed = False
+        self._unconfirmed, self._unlearned = False, 0.0
 
     def _settle(self, how: str) -> None:
         """Close the alarm, if there is one; `how` is the reason in the notification."""
@@ -316,6 +319,8 @@ class Learner:
 
     def _close_unexplained(self) -> None:
         """Close an alarm that no coefficient explained, and restart the judge, whose data it affected."""
+        assert self._standing.alarm is not None
+        self._unlearned = self._standing.alarm.size
         self._publication.judge.restart()
         self._settle("gone")
 
@@ -427,7 +432,7 @@ class Learner:
             self._publish("learned")
             return
         self._publication.publish(self.learned(), "learned")
-        self._unconfirmed = False
+        self._unconfirmed, self._unlearned = False, 0.0
         how = self._explained
         if self._standing.confirm():
             self._notify(f"explained again: {how}")

@@ -162,6 +162,22 @@ def test_sigma_covers_what_is_not_explained() -> None:
     assert learner.calibration is known
 
 
+def test_a_change_that_ended_without_a_cause_may_have_moved_the_offsets() -> None:
+    """Learning that starts again expects a change of the size that the alarm had."""
+    known = calibration()
+    added = np.zeros((700, 3))
+    added[100:140] = np.random.default_rng(1).normal(0.0, 60.0, (40, 3))  # disturbance of no known form
+    learner = Learner(known)
+    sizes: list[float] = []
+    learn(learner, World(known, 700), added=added, seen=lambda _: sizes.append(learner.state.size))
+    assert [notice.text for notice in learner.notices][1:] == ["explained again: gone"]
+    learner._restart_judged()
+    before = np.diag(known.covariance)[learner._model.offsets]
+    opened = np.diag(learner.learned().covariance)[learner._model.offsets] - before
+    size = next(size for size in reversed(sizes) if size > 0.0)
+    np.testing.assert_allclose(opened, 20.0**2 + size**2, rtol=1e-6)
+
+
 def test_flagged_samples_teach_nothing() -> None:
     """Neither flagged samples nor samples without a position update the learner."""
     known = calibration()
