@@ -16,6 +16,7 @@ from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, identity
 from magbridge.columns import TEMPERATURE, usual
 from magbridge.config import Align
+from magbridge.datasets import expect
 from magbridge.field.igrf import HeldField
 from magbridge.filter_lag import LagCorrection
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
@@ -70,6 +71,7 @@ class Correction:
         self.learner, self.held_field = learner, HeldField()
         self._given = settings is not None
         calibration = calibration if calibration is not None else identity()
+        expect("calibration", calibration, Calibration, "magbridge.load(path)")
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
         units = {parameter.name: parameter.unit for parameter in calibration.parameters}
         inputs = tuple(

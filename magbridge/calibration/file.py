@@ -28,6 +28,7 @@ from magbridge.calibration.model import (
 )
 from magbridge.calibration.scalar import PLATFORM_TERMS, ScalarSensor
 from magbridge.calibration.terms import Effect, Polynomial, Term, term_class
+from magbridge.datasets import expect
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.files import atomic_path, contents
 
@@ -168,8 +169,10 @@ def load(path: str | Path) -> Calibration:
 def save(calibration: Calibration, path: str | Path) -> None:
     """Write a calibration to a file ``cal.json`` in one step, so that it is never incomplete.
 
-    WriteError: the file cannot be written; the previous file is unchanged.
+    WriteError: the file cannot be written; the previous file is unchanged. WrongUse: `calibration` is not a
+    Calibration, but for example the result of a fit.
     """
+    expect("calibration", calibration, Calibration, "magbridge.load(path)")
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_calibration(calibration))
 

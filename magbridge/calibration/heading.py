@@ -34,6 +34,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.constants import DECLINATION_SIGMA_DEG, DECLINATION_SIGMA_NT_DEG
+from magbridge.errors import CalibrationError
 from magbridge.records import Quality
 
 Components = Sequence[Any]
@@ -158,8 +159,16 @@ def heading(
     Heading
         Its sigma is at most that of a uniform angle, 180 / sqrt(3) deg: a heading does not exist if the
         horizontal field is smaller than its own standard deviation.
+
+    Raises
+    ------
+    CalibrationError
+        `vector` has another shape.
     """
-    b = tuple(np.asarray(vector, float).reshape(-1, 3).T)
+    field = np.asarray(vector, float)
+    if field.shape[-1:] != (3,) or field.ndim > 2:
+        raise CalibrationError(f"vector: expected shape (n, 3), got {field.shape}")
+    b = tuple(field.reshape(-1, 3).T)
     V, Omega = (
         tuple(np.zeros(9) if given is None else np.reshape(given, (-1, 9)).T)
         for given in (covariance, boresight_covariance)
