@@ -67,11 +67,11 @@ class Fixing:
     `kind`: message of the fixes, a value of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
     `autopilot`: state of the autopilot; the caller has passed each message to it before.
     `gnss`: monitor of GPS; the caller has passed each GPS position to it before.
-    `sent`, `accepted`, `refused`: number of sent fixes, and of fixes accepted and rejected by the autopilot.
+    `sent`: number of sent fixes.
     """
 
     def __init__(self, kind: Kind, component: Component, autopilot: Autopilot, gnss: GnssMonitor) -> None:
-        self.sent = self.accepted = self.refused = 0
+        self.sent = 0
         self._kind, self._component, self._autopilot = kind, component, autopilot
         self._output = component.output
         self._gnss = gnss
@@ -192,8 +192,6 @@ class Fixing:
             return
         self._waiting, result = 0, message["result"]
         accepted = result == MAV_RESULT.ACCEPTED
-        self.accepted += accepted
-        self.refused += not accepted
         if time_us < self._report_us and result != self._result:
             return
         if result != self._result:

@@ -67,8 +67,6 @@ class Peers:
     `budget`: bytes/s that all other peers get together.
     `signed`: True if a frame is valid only after :meth:`credit` confirms it; else each known message is
     valid.
-    `ignored`: number of bytes that were not parsed, because their sender exceeded its limit.
-    `withheld`: number of bytes that were not sent to other peers, because the budget was used up.
     `notices`: texts about the peers that the bridge shall send as STATUSTEXT.
     """
 
@@ -87,7 +85,6 @@ class Peers:
         self._receivers: list[Peer] = []
         self._selection_s = 0.0
         self._reported: set[str] = set()
-        self.ignored = self.withheld = 0
         self.notices: deque[str] = deque(maxlen=8)
 
     def receive(self, address: Hashable, data: bytes) -> None:
@@ -102,7 +99,6 @@ class Peers:
         if now - peer.autopilot_s > PEER_SILENCE_S and (
             peer.unread > PEER_READ_BYTES or (not known and self._unknown_bytes > UNKNOWN_READ_BYTES)
         ):
-            self.ignored += len(data)
             return
         for message in peer.codec.parse(data):
             if message.id == BAD_DATA:
@@ -171,7 +167,6 @@ class Peers:
         )  # of a second
         self._allowance_s = now
         if size > self._allowance:
-            self.withheld += size
             self._notify(f"others get {self._budget / 1e3:g} kB/s in all: link.max_other_peers_rate", True)
             return False
         self._allowance -= size

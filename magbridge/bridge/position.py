@@ -32,16 +32,12 @@ from magbridge.link.telemetry import (
     is_null_position,
     own_time,
     sent_us,
-)  # fmt: skip
+)
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
 from magbridge.records import Corrected, Vector
 
-__all__ = [
-    "CLOCK_SET_US",
-    "LiveHeading",
-    "Position",
-]
+__all__ = ["CLOCK_SET_US", "LiveHeading", "Position"]
 
 POSITION = spec("GLOBAL_POSITION_INT")
 MAX_POSITION_AGE_US: Final = 60_000_000
@@ -63,8 +59,6 @@ dead reckoning is within it; over this distance the main field changes by at mos
 SUSPECT_US: Final = 900_000_000
 """Time for which the vehicle must stay at a position beyond a jump before the bridge uses the position,
 µs."""
-LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
-"""Largest magnitudes of GLOBAL_POSITION_INT's lat and lon, 1e-7 deg."""
 FIRST_US: Final = 60_000_000
 """Time after the first position in which a jump replaces the first positions, µs."""
 ALTITUDE_M: Final = -15_000.0, 100_000.0
@@ -104,15 +98,14 @@ class Position:
         return self._where, self._depth
 
     def update(self, message: Message, time_us: int) -> None:
-        """Update the position with a GLOBAL_POSITION_INT received at `time_us` (µs).
+        """Update the position with a GLOBAL_POSITION_INT of possible values, received at `time_us` (µs).
 
-        An unknown or impossible position is ignored. After a jump that no vehicle's speed explains, main
+        An unknown position is ignored. After a jump that no vehicle's speed explains, main
         field and anomaly are unknown. They are known again when the vehicle is near the former track, or
         has stayed beyond the jump for :data:`SUSPECT_US`. In the first minute, the new position is used.
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
-        # an autopilot that does not know its position sends one near 0, 0 or INT32_MAX
-        if is_null_position(message) or abs(lat) > LATITUDE_E7 or abs(lon) > LONGITUDE_E7:
+        if is_null_position(message):  # the autopilot does not know its position
             return
         if not ALTITUDE_M[0] < altitude < ALTITUDE_M[1]:
             altitude = 0.0

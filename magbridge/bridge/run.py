@@ -39,13 +39,7 @@ from magbridge.mavlink import Message, Spec, readable_by_all, spec
 from magbridge.mavlink.enums import MAG_PORT_NAME, MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = [
-    "FileServer",
-    "Keeper",
-    "leave_wrong_devices",
-    "ports",
-    "run",
-]
+__all__ = ["FileServer", "Keeper", "leave_wrong_devices", "ports", "run"]
 
 
 def load_state(path: str | Path) -> StartEvent:

@@ -56,7 +56,7 @@ class Commands:
 
     def __init__(self, component: Component) -> None:
         self._component, self._output = component, component.output
-        by_name: dict[str, Callable[[], bool]] = {
+        by_name: dict[str, Callable[[], bool | None]] = {
             "HEARTBEAT": component.send_heartbeat,
             "MAG_STATUS": component.send_status,
             "AUTOPILOT_VERSION": component.send_version,
@@ -64,7 +64,7 @@ class Commands:
             "COMPONENT_METADATA": component.send_metadata,
             **{name: partial(component.publisher.repeat, name) for name in PUBLISHED},
         }
-        self._messages: dict[int, Callable[[], bool]] = by_id(**by_name)
+        self._messages = by_id(**by_name)
         self._second_us = 0
         self._asked: dict[tuple[int, int], int] = {}
         self._commands = {
@@ -124,7 +124,7 @@ class Commands:
         answer = self._messages.get(to_integer(values[0]))
         if answer is None:
             return MAV_RESULT.DENIED
-        return MAV_RESULT.ACCEPTED if answer() else MAV_RESULT.TEMPORARILY_REJECTED
+        return MAV_RESULT.TEMPORARILY_REJECTED if answer() is False else MAV_RESULT.ACCEPTED
 
     def _set_interval(self, values: list[float]) -> MAV_RESULT:
         interval = values[1]
@@ -348,14 +348,13 @@ class Component:
         ts1 = self.vehicle.clock.ask(t_us)
         self.output.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
 
-    def send_heartbeat(self) -> bool:
-        """Send HEARTBEAT, with state ACTIVE if the sensor delivers readings, else CRITICAL; return True."""
+    def send_heartbeat(self) -> None:
+        """Send HEARTBEAT, with state ACTIVE if the sensor delivers readings, else CRITICAL."""
         is_alive = self._status().get("sensor_state") == MAG_PORT_STATE.OK
         self.output.put(HEARTBEAT_SPEC, ALIVE if is_alive else CRITICAL)
-        return True
 
-    def send_status(self) -> bool:
-        """Send MAG_STATUS, then those of `more_reports`; return True."""
+    def send_status(self) -> None:
+        """Send MAG_STATUS, then those of `more_reports`."""
         codec, vehicle = self.codec, self.vehicle
         clock = vehicle.clock
         payload = STATUS.payload(
@@ -378,19 +377,17 @@ class Component:
         self.output.put(STATUS, payload)
         for send in self.more_reports:
             send()
-        return True
 
-    def send_version(self) -> bool:
-        """Send AUTOPILOT_VERSION; return True."""
+    def send_version(self) -> None:
+        """Send AUTOPILOT_VERSION."""
         numbers = [int(number) & 0xFF for number in re.findall(r"\d+", self._version)[:3]]
         version = bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,))
         self.output.send(
             "AUTOPILOT_VERSION", capabilities=CAPABILITIES, flight_sw_version=int.from_bytes(version, "big")
         )
-        return True
 
-    def send_information(self) -> bool:
-        """Send COMPONENT_INFORMATION_BASIC; return True."""
+    def send_information(self) -> None:
+        """Send COMPONENT_INFORMATION_BASIC."""
         self.output.send(
             "COMPONENT_INFORMATION_BASIC",
             time_boot_ms=self._boot_ms,
@@ -399,10 +396,9 @@ class Component:
             model_name="magnetometer bridge",
             software_version=self._version,
         )
-        return True
 
-    def send_metadata(self) -> bool:
-        """Send COMPONENT_METADATA with the URI of the files that describe the parameters; return True."""
+    def send_metadata(self) -> None:
+        """Send COMPONENT_METADATA with the URI of the files that describe the parameters."""
         general, component = self.metadata[GENERAL], self.codec.component
         self.output.send(
             "COMPONENT_METADATA",
@@ -410,7 +406,6 @@ class Component:
             file_crc=crc32(general),
             uri=uri(component, GENERAL),
         )
-        return True
 
     @property
     def sample_rate(self) -> float:

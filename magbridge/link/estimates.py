@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import reduce
-from math import cos, inf, isfinite, nan, radians, sin, sqrt
-from operator import xor
+from math import cos, degrees, inf, isfinite, nan, radians, sin, sqrt
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -18,6 +16,7 @@ import msgspec
 from magbridge.link.output import Output
 from magbridge.mavlink.enums import GLOBAL_POSITION_SRC, MAV_AUTOPILOT, MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 from magbridge.mavlink.messages import east_e7
+from magbridge.sensors.framing import nmea_checksum
 
 __all__ = [
     "FIX_MESSAGES", "HEADING_SENDERS", "NO_ATTITUDE", "Attitude", "Fix", "Kind", "Pose", "nmea_sentences",
@@ -176,19 +175,17 @@ def nmea_sentences(attitude: Attitude, utc_us: int) -> bytes:
     if isfinite(attitude.declination):
         variation = f"{abs(attitude.declination):.1f},{'E' if attitude.declination >= 0.0 else 'W'}"
     # the second and third field are the deviation, which the calibration has removed
-    bodies = [f"HCHDG,{_wrapped(attitude.magnetic, 1)},0.0,E,{variation}"]
+    bodies = [f"$HCHDG,{_wrapped(attitude.magnetic, 1)},0.0,E,{variation}"]
     if isfinite(attitude.heading):
         clock = datetime.fromtimestamp(utc_us * 1e-6, UTC)
         seconds = f"{clock:%H%M%S}.{clock.microsecond // 1000:03d}"
-        roll, pitch, tilt = (
-            57.29577951308232 * one for one in (attitude.roll, attitude.pitch, attitude.tilt_sigma)
-        )
+        roll, pitch, tilt = map(degrees, (attitude.roll, attitude.pitch, attitude.tilt_sigma))
         accuracy = f"{tilt:.3f},{tilt:.3f},{attitude.sigma:.3f}"
         bodies += [
-            f"HCHDT,{_wrapped(attitude.heading, 1)},T",
-            f"PASHR,{seconds},{_wrapped(attitude.heading, 2)},T,{roll:+.2f},{pitch:+.2f},,{accuracy},0,0",
+            f"$HCHDT,{_wrapped(attitude.heading, 1)},T",
+            f"$PASHR,{seconds},{_wrapped(attitude.heading, 2)},T,{roll:+.2f},{pitch:+.2f},,{accuracy},0,0",
         ]
-    return b"".join(b"$%s*%02X\r\n" % (body.encode(), reduce(xor, body.encode())) for body in bodies)
+    return b"".join(b"%s*%02X\r\n" % (body.encode(), nmea_checksum(body.encode())) for body in bodies)
 
 
 def _wrapped(angle: float, decimals: int) -> str:

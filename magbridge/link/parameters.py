@@ -220,14 +220,11 @@ class ParameterService:
     def _list_unasked(self, time_us: int) -> None:
         self._unasked -= 1
         if self._unasked:
-            self._begin()
+            self.list()
             self._output.run_once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
 
-    def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
+    def list(self, message: Message | None = None) -> None:  # noqa: ARG002 - every handler takes one
         """Start to send all parameters, one every `PACE_US`; if a list is being sent, complete it first."""
-        self._begin()
-
-    def _begin(self) -> None:
         if not self._rounds:
             self._listed = 0
             self._output.every("parameters", PACE_US, self._send_next, self._output.codec.now_us)

@@ -12,10 +12,7 @@ from magbridge.align import Sample
 from magbridge.errors import ConfigError
 from magbridge.link.estimates import NO_ATTITUDE, Attitude, send_attitude
 from magbridge.link.output import Output, Rate, period_us
-from magbridge.link.parameters import (
-    Parameters,
-    rate_name,
-)
+from magbridge.link.parameters import Parameters, rate_name
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import EXTRA

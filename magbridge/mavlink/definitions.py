@@ -51,10 +51,7 @@ def write_definitions(folder: Path) -> list[Path]:
     for name, module_name in DIALECTS.items():
         module = folder / module_name
         reported = StringIO()
-        with (
-            redirect_stdout(reported),
-            redirect_stderr(reported),
-        ):  # mavgen prints every file that it reads
+        with redirect_stdout(reported), redirect_stderr(reported):  # mavgen prints every file that it reads
             options = mavgen.Opts(str(module), wire_protocol="2.0", language="Python3", validate=False)
             done = mavgen.mavgen(options, [str(folder / name)])
         if not done or not module.exists():

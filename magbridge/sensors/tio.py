@@ -25,17 +25,7 @@ from zlib import crc32
 from magbridge.columns import NT_PER_UNIT
 from magbridge.sensors.framing import CRC32_RESIDUE
 
-__all__ = [
-    "END",
-    "MAX_FRAME_BYTES",
-    "STREAM_TYPE",
-    "WRAP_1",
-    "Device",
-    "pack",
-    "requests",
-    "slip",
-    "unpack",
-]
+__all__ = ["END", "MAX_FRAME_BYTES", "STREAM_TYPE", "WRAP_1", "Device", "pack", "requests", "slip", "unpack"]
 
 END = b"\xc0"
 RPC_REQUEST, RPC_REPLY, RPC_ERROR, HEARTBEAT, TIMEBASE, SOURCE, STREAM, METADATA = 2, 3, 4, 5, 6, 7, 8, 11

@@ -104,6 +104,8 @@ def test_extreme_values_raise_nothing(seed: int, tmp_path: Path) -> None:
     for event in events(4000, seed):
         feed(bridge, files, event)
     files.close()
+    parameters = bridge.component.parameters
+    assert all(row.low <= parameters[name] <= row.high * 1.0001 for name, row in parameters.table.items())
     assert bridge.streams[0].samples > 500
     assert bridge.navigation is not None
     assert bridge.navigation.navigator.estimate.begun
@@ -117,14 +119,24 @@ def sent(bridge: FedBridge, second: int) -> list[Message]:
     return bridge.feed(second, Channel.SENSOR, b"1000 2000 50000 4 %d %d\n" % (second, second))
 
 
-def test_the_position_of_another_component_is_ignored_and_reported(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("component", "lat", "lon", "reported"),
+    [
+        (25, 505_000_000, -579_000_000, "position of component 25 ignored"),
+        (1, 0x7FFFFFFF, 0x7FFFFFFF, "GLOBAL_POSITION_INT with impossible values ignored"),
+        (1, 495_000_000, -1_900_000_000, "GLOBAL_POSITION_INT with impossible values ignored"),
+    ],
+)
+def test_a_position_of_another_component_or_of_no_place_is_ignored_and_reported(
+    tmp_path: Path, component: int, lat: int, lon: int, reported: str
+) -> None:
     bridge = FedBridge(small_bridge(tmp_path))
     bridge.feed(0.0, Channel.LINK, global_position(lat=495_000_000, lon=-579_000_000))
     (before,) = named(sent(bridge, 1), "MAG_FIELD")
-    bridge.feed(1.0, Channel.LINK, global_position(25, lat=505_000_000, lon=-579_000_000))
+    bridge.feed(1.0, Channel.LINK, global_position(component, lat=lat, lon=lon))
     (after,) = named(sent(bridge, 2), "MAG_FIELD")
     assert after["anomaly"] == pytest.approx(before["anomaly"], abs=0.1)
-    assert "position of component 25 ignored" in bridge.texts
+    assert reported in bridge.texts
 
 
 def test_a_part_that_raises_is_switched_off_and_the_sample_is_published(

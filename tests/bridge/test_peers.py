@@ -175,10 +175,11 @@ def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
         both.receive("station", beat(190, 255) * 20)
     for _ in range(1000):
         both.receive("autopilot", beat())
-    frames = [one for one in Codec(1, 191).parse(both.drain(), final=True) if one.known]
+    data = both.drain()
+    assert len(data) < 50_000, "not all of 650 kB of garbage"
+    frames = [one for one in Codec(1, 191).parse(data, final=True) if one.known]
     assert sum(one.component == 1 for one in frames) == 1000
     assert sum(one.component == 190 for one in frames) <= PEER_READ_BYTES / len(beat())
-    assert both.ignored > 10 * MAX_PARSED_PEERS * 900
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])

@@ -67,13 +67,6 @@ def test_an_old_position_or_none_gives_no_field() -> None:
     assert isnan(Position(print).main_field(START, START))
 
 
-@pytest.mark.parametrize("place", [(214.7483647, 214.7483647), (49.5, -190.0), (95.0, 0.0)], ids=str)
-def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[float, float]) -> None:
-    position = position_at(*place, 0.0)
-    assert position.place_and_depth[0] is None
-    assert isnan(position.main_field(START, START))
-
-
 def test_positions_of_an_autopilot_without_a_fix_are_unknown() -> None:
     """A real ArduPilot sends positions that drift about 0, 0 until its first fix."""
     reports: list[str] = []
