@@ -302,19 +302,14 @@ def test_a_message_with_a_name_needs_a_match(config: Path, message: str, key: st
     assert not any("match" in line for line in lines(config))
 
 
-def test_live_reports_a_wrong_rate(make_rig: Callable[..., Rig]) -> None:
-    rig = make_rig(sensor=("ascii", 'columns = ["x", "y", "z"]\nrate = 1.0'), hz=20.0)
-    check, _ = listened(rig)
-    assert any("ascii sends " in one.text and "readings/s, but rate = 1" in one.text for one in check.faults)
-
-
-def test_live_names_the_systems_that_send_and_telemetry_that_does_not_match(
+def test_live_names_a_wrong_rate_the_systems_that_send_and_telemetry_that_does_not_match(
     make_rig: Callable[..., Rig],
 ) -> None:
-    rig = make_rig()
+    rig = make_rig(sensor=("ascii", 'columns = ["x", "y", "z"]\nrate = 1.0'), hz=20.0)
     text = rig.config.read_text()
     rig.config.write_text(text.replace('{name = "battpos"}', '{name = "ballast"}'))
     check, _ = listened(rig)
+    assert any("ascii sends " in one.text and "readings/s, but rate = 1" in one.text for one in check.faults)
     assert any(
         "telemetry.battpos: NAMED_VALUE_FLOAT of component 1 does not match" in one.text
         and one.text.endswith(", got name = 'battpos'")

@@ -100,10 +100,7 @@ def test_the_messages_own_time() -> None:
     ("what", "complaint"),
     [
         (Telemetry("NO_SUCH", "x"), r"b.toml: telemetry.p.message: unknown MAVLink message 'NO_SUCH'"),
-        (
-            Telemetry("ATTITUDE", "rol"),
-            r"telemetry.p.field: ATTITUDE has no field 'rol'; did you mean roll?",
-        ),
+        (Telemetry("ATTITUDE", "rol"), r"telemetry.p.field: ATTITUDE has no field 'rol'; did you mean roll?"),
         (Telemetry("ATTITUDE", "roll[0]"), r"telemetry.p.field: roll without an index, not 'roll\[0\]'"),
         (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator"), r"actuator\[0\] to actuator\[31\], not 'actuator'"),
         (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[32]"), r"actuator\[0\] to actuator\[31\]"),

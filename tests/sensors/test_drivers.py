@@ -128,6 +128,8 @@ def test_garbage_costs_a_few_readings_at_most(case: str) -> None:
         ("ascii", {"columns": ["x", "y", "z", "q"]}, "sensor.options.columns: 'q' is none of x y z"),
         ("ascii", {"columns": ["x", "y", "z", "z"]}, "sensor.options.columns: 'z' stands there twice"),
         ("ascii", {"scale": float("inf")}, "sensor.options.scale: expected a finite number, got inf"),
+        ("ascii", {"scale": 0.0}, "sensor.options.scale: expected a number other than 0"),
+        ("ascii", {"keys": ["rx"]}, "sensor.options.keys: expected one for each of the 3 columns"),
         ("ascii", {"range": float("inf")}, "sensor.options.range: expected a finite number, got inf"),
         (
             "ascii",
