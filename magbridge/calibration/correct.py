@@ -48,7 +48,7 @@ class Corrector:
         self.calibration = calibration
         self._kernel = calibration.kernel
         self._omega = _omega_of(calibration)
-        self._steps = _steppers(calibration)
+        self._steps = [one.begin(calibration.channels, self._kernel) for one in calibration.effects]
         self._base = _base_flags(calibration)
         self._ranges = valid_ranges(calibration)
         self._wanted = len(calibration.channels)
@@ -226,11 +226,6 @@ def _omega_of(calibration: Calibration) -> tuple[float, ...] | None:
     return O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2]
 
 
-def _steppers(calibration: Calibration) -> list[Step]:
-    """Return a stepper for each effect, with its state as at power-on."""
-    return [effect.begin(calibration.channels, calibration.kernel) for effect in calibration.effects]
-
-
 def _base_flags(calibration: Calibration) -> int:
     """Return the flags that every sample gets because of the calibration itself."""
     flags = Quality(0) if calibration.boresight else Quality.NO_BORESIGHT
@@ -339,11 +334,11 @@ def _prepared_blocks(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> Iterator[tuple[slice, Prepared]]:
     """Yield the rows of each block, in order of time, and the input of :func:`.kernel.apply` for them."""
-    steps = _steppers(calibration)
+    kernel = calibration.kernel
+    steps = [effect.begin(calibration.channels, kernel) for effect in calibration.effects]
     for start in range(0, len(field), CORRECTED_AT_ONCE):
         part = slice(start, start + CORRECTED_AT_ONCE)
-        phi = _regressors(calibration.kernel, steps, field[part], channels[part], time[part])
-        yield part, _prepare_many(calibration.kernel, phi)
+        yield part, _prepare_many(kernel, _regressors(kernel, steps, field[part], channels[part], time[part]))
 
 
 def _regressors(
@@ -364,8 +359,7 @@ def regressors(
 ) -> FloatArray:
     """Return the regressors (m, n) of n samples, those of effects computed by their method ``batch``.
 
-    Arguments as for :func:`correct`. Unlike this function, :func:`correct` uses the effects' steppers, as the
-    bridge does.
+    Arguments as for :func:`correct`. Unlike it, :func:`correct` uses the steppers, as the bridge does.
     """
     kernel, channels = calibration.kernel, channels.reshape(len(field), -1)
     series = LogSeries(time, field, dict(zip(calibration.channels, channels.T, strict=True)), kernel)

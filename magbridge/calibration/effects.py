@@ -270,8 +270,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
     loop closes farther away. S is then ``S(v) = scale tanh((v - centre) / scale)``, a generalised play
     (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
 
-    `centre` is the position of the steel and `scale` the range of its effect; if `scale` is much longer than
-    the travel, S is linear.
+    `centre` is the position of the steel, `scale` the range of its effect; beyond the travel S is linear.
     """
 
     kind: ClassVar[str] = "play"
@@ -324,8 +323,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 def play(values: FloatArray, width: float) -> FloatArray:
     """Return the play operator y (n,) of `values` (n,), starting at the first value (:class:`PlayEffect`).
 
-    Each row clips the output of the previous row. Two clips in series are one clip, so the function combines
-    them over 2, 4, 8 ... rows.
+    Each row clips the output of the previous row. Two clips are one clip: combine 2, 4, 8 ... rows.
     """
     # Row t clips the output of row t - 1 to [p - w/2, p + w/2]; the first row begins in the middle.
     low, high = values - 0.5 * width, values + 0.5 * width
@@ -472,8 +470,7 @@ class ResponseEffect(MomentaryEffect, frozen=True, kw_only=True):
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
     """Index of the channel that has the knee."""
     knee: float = 0.0
-    """Reading at the knee, nT; s is its sign. Where ``s H >= s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``
-    with two coefficients, nT."""
+    """Reading at the knee, nT, of sign s. Where ``s H >= s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``."""
 
     @property
     def size(self) -> int:

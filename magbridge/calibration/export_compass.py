@@ -7,8 +7,7 @@ The autopilots correct with a symmetric matrix, an offset, and a vector times th
 
 magbridge corrects with ``b = R A(x) (h - T(x))``. So ``M = A`` and ``OFS = -T``, and a parameter in ampere
 gives ``MOT = -A dT/dI``, where T is the best straight line over the calibrated range of the current. The
-autopilot cannot represent moving masses, curved T(I), effects and the boresight R; the export reports the
-resulting error.
+autopilot cannot represent moving masses, curved T(I), effects and the boresight R; the export reports it.
 
 A Seaglider corrects counts of its compass in axes with y and z reversed, and levels the result with roll and
 pitch::
@@ -226,8 +225,7 @@ def _errors(calibration: Calibration, positions: FloatArray, dip_deg: float) -> 
 def position_table(calibration: Calibration, parameter: str) -> str:
     """Return a CSV table of offset (nT) and matrix M against one parameter, the others at the middle.
 
-    The corrected field of a reading h is ``b = M (h - offset)``, in body axes. CalibrationError: no such
-    parameter, or no boresight.
+    The corrected field is ``b = M (h - offset)``, body axes. CalibrationError: no parameter or boresight.
     """
     names = [one.name for one in calibration.parameters]
     if parameter not in names:

@@ -85,7 +85,10 @@ def box_flight(
     window = max(3, round(WINDOW_S / interval))
     swing = np.sqrt(2.0 * uniform_filter1d(_band(angles, interval) ** 2, window, axis=0))
     relative = swing / np.array(USUAL_AMPLITUDE_DEG)
-    # The axis with the largest swing relative to the usual amplitude; -1 without a swing.
+    # The axis with the largest swing relative to the usual amplitude, -1 without a swing, and the largest
+    # swing of the other axes in units of its own.
+    _, second, largest = np.sort(relative, axis=1).T
+    others = second / np.maximum(largest, 1e-300)
     axis = np.where(relative.max(axis=1) > MIN_AMPLITUDE_FRACTION, relative.argmax(axis=1), -1)
     axis[np.append(np.diff(time) > 3.0 * interval, False)] = -1
     # Stretches with the same axis are candidates for a manoeuvre.
@@ -95,16 +98,10 @@ def box_flight(
         for begin, end in pairwise(edges)
         if axis[begin] >= 0
         and time[end - 1] - time[begin] >= MIN_DURATION_S
-        and _is_of_one_axis(relative[begin:end], int(axis[begin]))
+        and np.median(others[begin:end]) < MAX_OTHER_AXES
     ]
     best = _one_for_each_heading(found)
     return BoxFlight(best, interval) if len(best) >= MIN_MANOEUVRES else None
-
-
-def _is_of_one_axis(relative: FloatArray, axis: int) -> bool:
-    """Return True if the other axes swing far less than `axis`; `relative` (n, 3): amplitudes."""
-    others = np.delete(relative, axis, axis=1).max(axis=1)
-    return bool(np.median(others / relative[:, axis]) < MAX_OTHER_AXES)
 
 
 def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:

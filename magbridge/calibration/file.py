@@ -160,8 +160,7 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
 def load(path: str | Path) -> Calibration:
     """Return the calibration in a file ``cal.json``.
 
-    FormatError: the file cannot be opened, or as for :func:`decode_calibration`. CalibrationError: as for
-    :func:`decode_calibration`.
+    FormatError: the file cannot be opened. Other errors are those of :func:`decode_calibration`.
     """
     return decode_calibration(contents(path), path)
 

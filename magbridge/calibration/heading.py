@@ -60,8 +60,7 @@ class Heading:
     true: FloatArray
     """(n,): Heading from true north, 0 to 360 deg; NaN if `magnetic` or the declination is unknown."""
     sigma: FloatArray
-    """(n,): Standard deviation of `true`, deg; of `magnetic` if the declination is unknown; infinite if
-    `magnetic` is NaN."""
+    """(n,): 1-sigma of `true`, deg; of `magnetic` if the declination is unknown; infinite if it is NaN."""
 
 
 def _level(b: Components, turn: Components) -> Components:

@@ -181,8 +181,7 @@ def prepare(t: list[Any]) -> Prepared:
 def variances(dx: Any, dy: Any, dz: Any, V: list[list[Any]]) -> list[Any]:
     """Return the corrected vector's covariance V, entries xx, yy, zz, xy, xz, yz, nT^2.
 
-    ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij``. `dx`, `dy`, `dz`: ``d = H_r - T``, nT. `V`: from
-    :func:`prepare`.
+    ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij`` with d in nT, and `V` from :func:`prepare`.
     """
     exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
     return [

@@ -151,19 +151,15 @@ def _table(
         S = np.sum([C[i, :, j] + (C[j, :, i] if i != j else 0.0) for i, j in pairs], axis=0)
         if q == 0:  # the sensor's noise adds to the reading as an error of T does
             S[9:, 9:] += calibration.noise.sensor**2 * np.eye(3)
-        table[q, 12:] = _combinations(S)
+        # Q (V's six entries by the six products of d), S_a'T (9 x 3) and S_TT (6)
+        Q = [
+            S[3 * i + k, 3 * j + l] + (S[3 * i + l, 3 * j + k] if k != l else 0.0)
+            for i, j in PAIRS
+            for k, l in PAIRS  # noqa: E741  (the index of the equation)
+        ]
+        table[q, 12:] = [*Q, *S[:9, 9:].ravel(), *(S[9 + i, 9 + j] for i, j in PAIRS)]
     first, second = np.array([pairs[0] for pairs in products.values()]).T
     return first, second, table
-
-
-def _combinations(S: FloatArray) -> FloatArray:
-    """Return Q (6 x 6), ``S_a'T`` (9 x 3) and ``S_TT`` (6) of the covariance S (12, 12) of A' and T."""
-    Q = [
-        S[3 * i + k, 3 * j + l] + (S[3 * i + l, 3 * j + k] if k != l else 0.0)
-        for i, j in PAIRS
-        for k, l in PAIRS  # noqa: E741  (the index of the equation)
-    ]
-    return np.array([*Q, *S[:9, 9:].ravel(), *(S[9 + i, 9 + j] for i, j in PAIRS)])
 
 
 class CalibratedSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -385,8 +381,7 @@ class Calibration:
     def at_level(self) -> Calibration:
         """Return the calibration with its coefficients moved by :data:`LEVEL_STEP_SIGMA` times `level`.
 
-        A whole 1-sigma may move the offset by 100 nT across the field, and the total field is not linear in
-        such a step.
+        A whole 1-sigma may move the offset by 100 nT across the field, beyond where the length is linear.
         """
         # a change of the constant bias moves the first coefficients together, along one direction
         moved = self.coefficients.copy()

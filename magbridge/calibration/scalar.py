@@ -380,8 +380,7 @@ def compare_sensors(
 ) -> SensorDisagreement:
     """Compare a compensated scalar sensor with the length of a corrected vector.
 
-    All are (n,), nT: both sensors' total field with its standard deviation, and the expected field; NaN where
-    unknown.
+    All are (n,), nT: both sensors' total field with its 1-sigma, and the reference; NaN where unknown.
 
     Notes
     -----

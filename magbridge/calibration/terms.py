@@ -30,8 +30,7 @@ __all__ = [
 
 Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
-"""Function that takes a sample's time (µs), raw channels x, y, z (nT) and telemetry values, and returns the
-regressors of an effect."""
+"""Function from a sample's time (µs), raw channels x, y, z (nT) and telemetry to an effect's regressors."""
 
 MAX_ORDER = 30
 """Largest total degree of a monomial."""
@@ -42,8 +41,7 @@ Position = Annotated[float, Meta(ge=-1e12, le=1e12)]
 """Position of a mass, or the value of another parameter, in any unit."""
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
-"""Names of the nine coefficients: six of the symmetric ``A`` (as ``a = (A - I) F_0``) and three of ``T``; all
-in nT."""
+"""Names of the nine coefficients, nT: six of the symmetric ``A`` (as ``a = (A - I) F_0``), three of ``T``."""
 
 TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
@@ -162,8 +160,7 @@ class Effect(Term, frozen=True, kw_only=True):
     remembers: ClassVar[bool] = True
     """True if regressors depend on earlier samples too, so that some rows of a log need the whole log."""
     cause: str = ""
-    """Cause, as named in ``findings.json``, for which a diagnosis added the effect; empty if another source
-    added it."""
+    """Cause, as named in ``findings.json``, for which a diagnosis added the effect; else empty."""
 
     def channels(self) -> tuple[str, ...]:
         """Return the names of the telemetry channels that the effect needs: parameters or other columns."""

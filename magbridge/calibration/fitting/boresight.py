@@ -91,8 +91,7 @@ COMPASS_SIGMA = np.radians(0.5)
 def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
     """Return a field in body axes, (n, 3), nT.
 
-    `attitude` (n, 3): roll, pitch, heading (3-2-1 rotation), rad. `field_ned` (n, 3): the field north-east-
-    down, nT.
+    `attitude` (n, 3): roll, pitch, heading (3-2-1), rad. `field_ned` (n, 3): north-east-down, nT.
     """
     body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
     return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
@@ -247,11 +246,9 @@ def _gauss_newton(
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
     """Return the rotation from corrected sensor axes to body axes, from roll, pitch and heading.
 
-    The result is None if too few samples have attitude and reference direction, or the calibration has
-    effects.
+    None: too few samples have attitude and reference direction, or the calibration has effects.
 
-    CalibrationError: after the best rotation, the corrected vectors and the reference still differ by more
-    than :data:`MISMATCH`.
+    CalibrationError: after the best rotation, vectors and reference differ by more than :data:`MISMATCH`.
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:

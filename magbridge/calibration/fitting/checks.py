@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -29,8 +29,7 @@ MIN_POSITION_STEP_FRACTION = 0.02
 """Smallest distance between two positions of a mass, as a fraction of half its range, and smallest fraction
 of the samples at a position that counts."""
 SWEPT = 0.3
-"""Width of one group of positions, as a fraction of half the range, above which the mass moved
-continuously."""
+"""Width of a group of positions over half the range, above which the mass moved continuously."""
 MAX_CORRELATION = 0.9
 """Correlation of two positions above which their effects cannot be distinguished."""
 BANKED = 10.0
@@ -121,15 +120,6 @@ def _runs(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
         yield Diagnostic("few_runs", {"runs": counted(count, "run")})
 
 
-CHECKS: tuple[Callable[[Calibration, Observations], Iterator[Diagnostic]], ...] = (
-    _positions,
-    _moved_together,
-    _attitudes,
-    _runs,
-)
-"""Checks of the runs; each yields a diagnostic for each fault that it finds."""
-
-
 # ---- The checks of a whole fit ----
 
 UNSUPPORTED = 5.0
@@ -177,6 +167,7 @@ def judged(found: Fit, data: Observations) -> Fit:
     if ratio > UNSUPPORTED:
         warnings = (*warnings, *found.open)
     reasons = tuple(warning.text for warning in warnings)
+    checks = _positions, _moved_together, _attitudes, _runs
     unsupported = [Diagnostic("unsupported_fit", {"reasons": "; ".join(reasons)})] if reasons else []
     return replace(
         found,
@@ -184,7 +175,7 @@ def judged(found: Fit, data: Observations) -> Fit:
         warnings=(
             *unsupported,
             *(found.open if ratio <= UNSUPPORTED else ()),
-            *(warning for check in CHECKS for warning in check(calibration, data)),
+            *(one for check in checks for one in check(calibration, data)),
             *mismatch,
             *_suspicions(found),
         ),

@@ -324,8 +324,7 @@ MIN_WEIGHT = 0.01
 def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[float, Choice]]:
     """Return the points of the mixture in the module's notes, each with its weight; the first is `best`.
 
-    The weights add up to 1. `score`: function that returns the log evidence of a choice, or raises
-    LinAlgError.
+    The weights add up to 1. `score`: log evidence of a choice; it may raise LinAlgError.
     """
     if best.field.nodes.size > MAX_UNCERTAIN_NODES:
         return [(1.0, best)]

@@ -38,8 +38,7 @@ METHODS: dict[str, str] = {
     "runs": "magbridge.calibration.fitting.methods:fit_per_run",
     "horizontal": "magbridge.calibration.fitting.methods:fit_horizontal",
 }
-"""Function of each method as ``module:function``; its signature is ``(observations, order, **options) ->
-Fit``."""
+"""Function ``(observations, order, **options) -> Fit`` of each method, as ``module:function``."""
 
 ONE_ATTITUDE = 5.0
 """Angle from the mean field direction within which 95 % of the samples count as a single attitude, deg."""

@@ -58,8 +58,7 @@ from magbridge.estimation.residual import rms
 REFERENCE_ERROR_LENGTH_M = 25_000.0
 """Distance over which the reference's bias changes by its 1-sigma, m; 6 nT/km for 138 nT."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
-"""Prior 1-sigma of the slow change with time on a magnetically quiet day, nT, and 1-sigma of its
-logarithm."""
+"""Prior 1-sigma of the slow change on a magnetically quiet day, nT, and 1-sigma of its logarithm."""
 DRIFTING = 2700.0
 """Half the period of the fastest drift of positions, s."""
 

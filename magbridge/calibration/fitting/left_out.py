@@ -57,8 +57,7 @@ class LeftOut:
     rms: float
     """RMS error, nT as the sensor measures; an outlier counts as five sigmas."""
     ratio: float
-    """RMS of errors over their predicted sigmas, for parts or for groups; 1 if it is not significantly
-    larger."""
+    """RMS of errors over predicted sigmas, of parts or groups; 1 if it is not significantly larger."""
     carried: float
     """RMS error, nT, that also includes later parts predicted from the earlier parts."""
 

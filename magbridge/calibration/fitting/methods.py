@@ -13,8 +13,7 @@ a free ellipsoid can collapse: ``A -> 0`` with ``T -> infinity`` makes every res
 and soft iron have a prior of physical width, and the method rejects a fit that has collapsed.
 
 ``cubic`` (section 2.2 of the paper) fits free polynomials, starting at the nominal ellipsoid. Outside its
-data it is wrong in every combination of coefficients that the runs do not determine; these keep the prior
-width :data:`FREE_SIGMA_NT`.
+data it is wrong where the runs do not determine the coefficients: these keep :data:`FREE_SIGMA_NT`.
 
 ``runs`` (the first stage of section 2.2) fits an ellipsoid to each run, with a prior about the nominal
 ellipsoid of all runs. It then fits polynomials to these ellipsoids, each weighted by its precision::
@@ -68,8 +67,7 @@ def fit_auto(
     """Fit polynomials up to a total degree with physical priors (method ``auto`` of the module's notes).
 
     `order`: highest total degree. `vehicle`: measured position of masses, by parameter; the prior of their
-    coefficients then consists of dipoles there. `known`: expected coefficients, instead of the physical
-    prior.
+    coefficients is then that of dipoles. `known`: expected coefficients, instead of the physical prior.
 
     CalibrationError: no start converged, or the best fit collapsed.
     """
@@ -237,8 +235,7 @@ def _precision(E: FloatArray, factor: float) -> FloatArray:
 # ---- The paper's cubic polynomials ----
 
 REFERENCE_NOISE_RATIO = 1e4
-"""Value of kappa that assigns all noise to the reference, so that the residual is proportional to the paper's
-``|A(H_r - T)| - H_e``."""
+"""Kappa that assigns all noise to the reference: the residual is the paper's ``|A(H_r - T)| - H_e``."""
 FREE_SIGMA_NT = 1e4
 """Prior 1-sigma of a free coefficient, nT, which is wide enough not to affect determined coefficients."""
 

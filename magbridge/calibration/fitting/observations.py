@@ -22,8 +22,7 @@ from magbridge.records import MAX_MEASURED_NT
 RARE = 0.001
 """Fraction of the samples at each end that the range of a condition excludes."""
 COMMON, FAR = 0.005, 10.0
-"""A position is implausible if it is farther from the median than FAR times the span between the quantiles
-COMMON and 1 - COMMON."""
+"""A position is implausible FAR spans (between the quantiles COMMON and 1 - COMMON) from the median."""
 _PER_SAMPLE = (
     "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned", "place", "unmapped",
     "temperature", "depth",
@@ -47,8 +46,7 @@ class Observations:
     units: tuple[str, ...] = ()
     """`names`, `units`: Name and unit of each parameter."""
     runs: NDArray[np.generic] = attribute(default_factory=lambda: np.empty(0))
-    """(n,): Label of each sample's run: a dive, spiral or file; default: one run. Cross-validation holds out
-    whole runs."""
+    """(n,): Run of each sample (dive, spiral, file); default: one. Cross-validation holds out runs."""
     time: FloatArray = attribute(default_factory=lambda: np.empty(0))
     """(n,): Time of the samples, s since 1970 UTC; default: one sample per second."""
     attitude: FloatArray | None = None
@@ -103,7 +101,10 @@ class Observations:
         field = np.where((np.abs(field) < MAX_MEASURED_NT) & ~absent, field, np.nan)
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
-        _enough(n, whole, field, parameters, self.names, reference)
+        named = zip(("mag_x", "mag_y", "mag_z", *self.names), (*field.T, *parameters.T), strict=True)
+        _enough(whole, {**dict(named), "reference field": reference})
+        if not (reference[whole] > 0).all():
+            raise CalibrationError("reference field: expected positive numbers (nT)")
         _plausible(self.names, parameters[whole])
         values = {
             "field": field,
@@ -148,8 +149,7 @@ class Observations:
     def directed(self) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Return a mask, and the attitude and reference vector of the m samples that have both.
 
-        The mask (n,) is True for these samples. The attitude (m, 3) is in rad, and the reference (m, 3),
-        north-east-down, in nT.
+        Mask (n,), attitude (m, 3) in rad, reference (m, 3) north-east-down in nT.
         """
         if self.attitude is None or self.reference_ned is None:
             return np.zeros(len(self), bool), np.empty((0, 3)), np.empty((0, 3))
@@ -240,26 +240,12 @@ def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> Bo
     return np.asarray(np.cumsum(bounds)[:-1] > 0.0)
 
 
-def _enough(
-    n: int,
-    complete: BoolArray,
-    field: FloatArray,
-    parameters: FloatArray,
-    names: Sequence[str],
-    reference: FloatArray,
-) -> None:
-    """Raise CalibrationError if fewer than 10 of n samples are `complete` (n,), or a reference is <= 0."""
+def _enough(complete: BoolArray, columns: dict[str, FloatArray]) -> None:
+    """Raise CalibrationError if fewer than 10 samples are `complete` (n,); `columns`: values (n,) by name."""
     if complete.sum() >= 10:
-        if not (reference[complete] > 0).all():
-            raise CalibrationError("reference field: expected positive numbers (nT)")
         return
     # name the column with too few numbers, or say that the rows do not match
-    columns = zip(
-        ("mag_x", "mag_y", "mag_z", *names, "reference field"),
-        (*field.T, *parameters.T, reference),
-        strict=True,
-    )
-    counts = {name: int(np.isfinite(column).sum()) for name, column in columns}
+    n, counts = len(complete), {name: int(np.isfinite(column).sum()) for name, column in columns.items()}
     reasons = [f"{name!r} has {count}" for name, count in counts.items() if count < min(n, 10)]
     because = f" ({', '.join(reasons)} numbers)" if reasons else ""
     if n >= 10 and not reasons:

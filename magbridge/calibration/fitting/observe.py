@@ -104,14 +104,11 @@ def at_one_time(ds: xr.Dataset) -> xr.Dataset:
     wrong when the vehicle flies straight.
     """
     late = [axis for axis in "xyz" if {f"mag_{axis}", f"mag_time_{axis}"} <= set(ds.variables)]
-    channels = {f"mag_{axis}": ("time", _at_rows(ds, axis), ds[f"mag_{axis}"].attrs) for axis in late}
+    time, channels = np.asarray(ds["time"].values, float), {}
+    for axis in late:
+        name, sampled = f"mag_{axis}", _column(ds, f"mag_time_{axis}")
+        channels[name] = "time", interpolate_to_rows(time, sampled, _column(ds, name))[0], ds[name].attrs
     return ds.assign(channels).drop_vars([f"mag_time_{axis}" for axis in late])
-
-
-def _at_rows(ds: xr.Dataset, axis: str) -> FloatArray:
-    """Return the magnetometer channel of an `axis`, interpolated to the rows' times, (n,), nT."""
-    time = np.asarray(ds["time"].values, float)
-    return interpolate_to_rows(time, _column(ds, f"mag_time_{axis}"), _column(ds, f"mag_{axis}"))[0]
 
 
 def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple[float, float]]:

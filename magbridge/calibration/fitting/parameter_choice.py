@@ -51,8 +51,7 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
     -----
     A mass at position c adds a field ``d(c)`` to the vector, and ``d(c) . u`` to the total field, with u the
     field's direction. The residual is regressed on ``u, c u, c^2 u``, and on the same functions of each
-    declared parameter, which may have absorbed a part of the effect of c. The improvement by c is measured on
-    held-out parts.
+    declared parameter, which may have absorbed a part of it. Held-out parts show the improvement by c.
     """
     lines: list[str] = []
     conditional_on: tuple[str, ...] = ()
@@ -207,19 +206,15 @@ def best_parameters(
                 tries.append((partner, both, further))
         _, last, _ = tries[-1]
         better = last is not None and _predicts_better(last, found) and not _is_distorted(last, found)
-        offers += [_offer(one, after, before, taken=better) for one, after, before in tries]
+        for one, after, before in tries:
+            left_out = np.inf if after is None else float(after.details["left_out_nT"])
+            offers.append(Offer(one, float(before.details["left_out_nT"]), left_out, better))
         if better and last is not None:
             taken, found = (*taken, *(one for one, _, _ in tries)), last
             failed.clear()
         else:
             failed.add(name)
     return taken, offers
-
-
-def _offer(name: str, further: Fit | None, found: Fit, *, taken: bool) -> Offer:
-    """Return the errors of a fit with a further column, next to those of the fit without it."""
-    left_out = np.inf if further is None else float(further.details["left_out_nT"])
-    return Offer(name, float(found.details["left_out_nT"]), left_out, taken)
 
 
 def _predicts_better(further: Fit, found: Fit) -> bool:

@@ -133,8 +133,7 @@ def mounted_prior(
 ) -> PriorFamily:
     """Return the prior `free` of polynomials with the unknowns of a dipole added for each mass of `vehicle`.
 
-    CalibrationError: no parameter moves a mass of `vehicle`, or a mass is too near the sensor for a power
-    series.
+    CalibrationError: no parameter moves a mass, or it is too near the sensor for a power series.
     """
     names = [parameter.name for parameter in parameters]
     masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]
@@ -309,8 +308,7 @@ class Posed:
 def pose(data: Observations, order: int, vehicle: Vehicle | None = None, known: Known | None = None) -> Posed:
     """Return the input of a fit of polynomials up to the total degree `order` to `data`.
 
-    `vehicle`: mounting of the masses, by parameter. `known`: prior with monomials of its own, instead of
-    `order`.
+    `vehicle`: mounting of the masses, by parameter. `known`: prior with its own monomials, not `order`.
 
     CalibrationError: `vehicle` and `known` are both given, or `known` has other parameters than `data`.
     """

@@ -48,8 +48,7 @@ class Fit:
     warnings: tuple[Diagnostic, ...]
     """Warnings about undetermined quantities and excluded samples."""
     details: dict[str, Any]
-    """Results of the method by name: evidence, prior widths, number of determined coefficients, held-out
-    errors."""
+    """Results of the method by name: evidence, prior widths, determined coefficients, held-out errors."""
     samples: ResidualSamples
     """Samples of the fit, for :mod:`.checks`."""
     open: tuple[Diagnostic, ...] = ()
@@ -109,24 +108,23 @@ def assemble(
     """
     # sigma and covariance grow by the ratio of held-out errors to claimed ones
     e, samples, noise, covariance = found.residual, found.samples, found.noise, found.covariance
-    information = _without_prior(found) if informative else None
+    information = None
+    if informative:  # of the data alone: the posterior's minus the prior's
+        prior = found.prior
+        before = prior.E @ np.linalg.inv(prior.precision) @ prior.E.T
+        centre = np.broadcast_to(prior.offset, found.coefficients.shape)
+        information = GaussianInformation.from_posterior(found.coefficients, covariance, centre, before)
     if left_out is not None:
         information = information and information.divided(left_out.ratio)
         noise, covariance = replace(noise, sigma=noise.sigma * left_out.ratio), covariance * left_out.ratio**2
         details = {**(details or {}), "left_out_nT": left_out.rms, "left_out_ratio": left_out.ratio}
-    steps = np.diff(data.time)
+    interval = float(np.median(np.diff(data.time))) if len(data) > 1 else 0.0
     calibration = Calibration(
         parameters=posed.ranges,
         terms=(Polynomial(exponents=posed.exponents),),
         coefficients=found.coefficients,
         covariance=covariance,
-        noise=Noise(
-            noise.sigma,
-            samples.kappa * noise.sigma,
-            noise.autocorrelation,
-            float(np.median(steps)) if steps.size else 0.0,
-            noise.white,
-        ),
+        noise=Noise(noise.sigma, samples.kappa * noise.sigma, noise.autocorrelation, interval, noise.white),
         reference=Reference(samples.F_0, data.model),
         sensor=CalibratedSensor(data.sensor, filter_cutoff=data.filter_cutoff),
         runs=_runs(data, e),
@@ -135,15 +133,6 @@ def assemble(
         software=f"magbridge {__version__}",
     )
     return Fit(calibration, e, (), details or {}, samples, information=information)
-
-
-def _without_prior(found: CoefficientPosterior) -> GaussianInformation:
-    """Return the information of the data alone, from the posterior and its prior."""
-    # information of the data = posterior's minus the prior's
-    prior, coefficients = found.prior, found.coefficients
-    before = prior.E @ np.linalg.inv(prior.precision) @ prior.E.T
-    centre = np.broadcast_to(prior.offset, coefficients.shape)
-    return GaussianInformation.from_posterior(coefficients, found.covariance, centre, before)
 
 
 def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:

@@ -89,8 +89,7 @@ class Answer:
 # ---- The iterations ----
 
 INITIAL_ITERATIONS = 2
-"""Number of iterations before the search of the field, because initially errors of the coefficients look like
-crustal field."""
+"""Number of iterations before the search of the field: first errors of coefficients look like crust."""
 SEARCHES = 2
 """Number of further iterations in which the search continues."""
 MAX_SURVEY_ITERATIONS = 40

@@ -175,7 +175,12 @@ def fit_scalar(
             f"{', '.join(names) or 'no telemetry'}, got {int(valid.sum())}"
         )
     channels = tuple(
-        _channel(name, series.channels[valid, k], units[k] if units else "") for k, name in enumerate(names)
+        ScalarChannel(
+            name, float(np.median(values)), _quantiles(values), float(values.min()), float(values.max()), unit
+        )
+        for name, values, unit in zip(
+            names, series.channels[valid].T, units or [""] * len(names), strict=True
+        )
     )
     reference_field = float(np.median(series.reference[valid]))
     valid &= _agreeing(series, valid, channels, reference_field)
@@ -204,8 +209,7 @@ def _agreeing(
     Notes
     -----
     The crustal field is in both sensors, so that the difference of scalar and vector length is the platform's
-    field and noise. A fit of the model's columns by least absolute values leaves a source that no channel
-    shows.
+    field and noise. A fit of its columns by least absolute values leaves a source that no channel shows.
     """
     design = scalar_design(series, channels, reference_field)
     design = np.column_stack([design, np.ones(len(design))])
@@ -277,8 +281,7 @@ def is_significant(values: FloatArray, covariance: FloatArray, tests: int) -> bo
 
     Notes
     -----
-    ``c^T C^-1 c`` of k coefficients that are zero, with their covariance C (k, k), is a chi-square of k
-    degrees.
+    ``c^T C^-1 c`` of k zero coefficients, with their covariance C (k, k), is a chi-square of k degrees.
     """
     squared = float(values @ np.linalg.solve(covariance, values))
     return bool(chdtrc(len(values), squared) < FALSE_NAME_LEVEL / max(tests, 1))
@@ -306,11 +309,9 @@ def _findings(
     return tuple(found)
 
 
-def _channel(name: str, values: FloatArray, unit: str) -> ScalarChannel:
+def _quantiles(values: FloatArray) -> tuple[float, float]:
     low, high = np.quantile(values, [0.02, 0.98]).tolist()
-    return ScalarChannel(
-        name, float(np.median(values)), (low, high), float(values.min()), float(values.max()), unit
-    )
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)
@@ -518,8 +519,7 @@ def _marginal(sensor: ScalarSensor, data: GaussianInformation) -> ScalarSensor:
     -----
     A channel that hardly moved in the fitted log has a width that only its prior limits, so the covariance at
     the most probable widths is too small. The law of total covariance, ``E[C] + cov[mean] - C(mode)``, is
-    summed over one width after another on a grid of its log, the others at their mode (Rasmussen & Williams
-    2006, section 5.2).
+    summed over one width after another on a grid, the others at their mode (Rasmussen & Williams, sec. 5.2).
     """
     family, log_widths = _sensor_prior(sensor)
     _, at_mode = _coefficients(data, family.widths(log_widths))
@@ -560,14 +560,13 @@ def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
     -----
     The data's information about the coefficients, ``P - 1 / prior^2`` and ``P mean``, is unchanged; a
     channel's coefficients are per unit of its new swing, and the widths maximise the evidence again. A
-    channel that hardly moved in the fitted log and moves far in this one thus has a weak estimate and a
-    large sigma.
+    channel that hardly moved in the fitted log and moves far in this one thus has a large sigma.
     """
     factor, wider = np.ones(len(sensor.coefficients)), list(sensor.channels)
     for k, channel in enumerate(sensor.channels):
         values = channels[np.isfinite(channels[:, k]), k]
         if len(values):
-            low, high = np.quantile(values, [0.02, 0.98]).tolist()
+            low, high = _quantiles(values)
             quantiles = min(channel.quantiles[0], low), max(channel.quantiles[1], high)
             wider[k] = msgspec.structs.replace(channel, quantiles=quantiles)
             columns = slice(PLATFORM_TERMS + 3 * k, PLATFORM_TERMS + 3 * k + 3)

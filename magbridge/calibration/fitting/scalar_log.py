@@ -94,8 +94,7 @@ def calibrate_scalar(
 
     `calibration` is that of the vector sensor, which gives the directions. The reference is the log's, or the
     main field plus `grid`; with `map_known` it includes the crustal field. `lag` is that of the scalar behind
-    the vector, s, estimated if not given; `lever` is the scalar's place relative to the positions, m forward,
-    starboard and down.
+    the vector, s, estimated if not given; `lever` leads from positions to scalar, m forward, starboard, down.
 
     FormatError: a column is missing, or there is neither a reference nor a position. DataError: the reading
     is not nT. CalibrationError: too few samples.
@@ -170,8 +169,7 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
     """Return a corrected log with :data:`SCALAR_COLUMNS` of the first of the sensors that the log has.
 
     ``total_field_sigma`` is larger where the two sensors differ and the vector sensor may be the cause. The
-    log is unchanged where it has no such column. FormatError: it lacks a telemetry channel of the
-    compensation.
+    log is unchanged where it has no such column. FormatError: it lacks a telemetry channel.
     """
     sensor = next((one for one in sensors if one.column in log), None)
     if sensor is None:

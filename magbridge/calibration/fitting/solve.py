@@ -165,22 +165,16 @@ def lasting_noise(
     root = np.linalg.cholesky(covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision))
     pulls = np.clip(e, -limit, limit)[:, None] * (g @ (prior.E @ root))
     repeats = samples_per_independent(pulls, samples.steps)
+    # with a white fraction w: sum of the autocorrelations at all lags (1 - w) rho / (1 - rho), and that of
+    # successive samples (1 - w) rho
+    lasting = 0.5 * (repeats - 1.0)
     neighbours = estimate_noise(e, samples.steps, len(found.z)).autocorrelation
-    rho, white = _slow_and_white(0.5 * (repeats - 1.0), neighbours)
+    rho, white = max(lasting / (1.0 + lasting), 0.0), 0.0
+    if 0.0 < neighbours < lasting and neighbours < 1.0 - neighbours / lasting:
+        rho = 1.0 - neighbours / lasting  # a slow part that lasts beyond the next sample
+        white = 1.0 - neighbours / rho
     one = replace(noise, autocorrelation=rho, white=white)
     return one, replace(noise, sigma=noise.sigma * np.sqrt(repeats))
-
-
-def _slow_and_white(lasting: float, neighbours: float) -> tuple[float, float]:
-    """Return autocorrelation rho and white fraction w of the sum of white noise and an AR(1) process.
-
-    `lasting`: sum of the autocorrelations at all lags, ``(1 - w) rho / (1 - rho)``. `neighbours`:
-    autocorrelation of successive samples, ``(1 - w) rho``.
-    """
-    if not 0.0 < neighbours < lasting:  # no slow part, or none that lasts beyond the next sample
-        return max(lasting / (1.0 + lasting), 0.0), 0.0
-    rho = 1.0 - neighbours / lasting
-    return (rho, 1.0 - neighbours / rho) if neighbours < rho else (lasting / (1.0 + lasting), 0.0)
 
 
 # ---- Widths by the evidence ----
@@ -288,8 +282,7 @@ def with_slow_noise(answer: Climbed) -> Climbed:
 # ---- Where a fit begins, and with which samples ----
 
 ENOUGH, BLOCK = 6000, 50
-"""Largest number of samples that choose the start, and number of successive samples in each of their
-blocks."""
+"""Largest number of samples that choose the start, and number of samples in each of their blocks."""
 MIN_END_SAMPLES = 20
 """Smallest number of samples that :func:`flown` removes from an end of the log."""
 MIN_OUTLIER_FRACTION = 0.7
@@ -299,8 +292,7 @@ MIN_OUTLIER_FRACTION = 0.7
 def starts(samples: ResidualSamples) -> list[FloatArray]:
     """Return two initial sets of coefficients (9,), nT: zeros, and the offset of the best sphere.
 
-    The sphere follows from linear least squares, because ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T
-    and one constant.
+    The sphere follows from linear least squares: ``|h|^2 = 2 h^T T + constant`` is linear in T.
     """
     h = samples.field
     design = np.column_stack([2.0 * h, np.full(len(h), samples.F_0)])
@@ -335,8 +327,7 @@ def successive(samples: ResidualSamples, rows: IndexArray) -> ResidualSamples:
 def flown(residual: FloatArray) -> BoolArray:
     """Return a mask (n,) that is False for samples at the ends of the log that contradict the others.
 
-    Such samples are a crash or a launch. `residual` (n,): residual of a robust fit, in the order of the log,
-    nT.
+    Such samples are a crash or a launch. `residual` (n,): of a robust fit, in the order of the log, nT.
     """
     # an end is cut where most of its samples are outliers
     off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)

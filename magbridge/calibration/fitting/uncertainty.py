@@ -36,16 +36,21 @@ def with_level(
     """Return the calibration with the part of its covariance that is common to all samples (the level).
 
     If the estimated bias exceeds :data:`CONTRADICTS` sigmas of its prior, the fit has absorbed another effect
-    into it. The function then sets the bias to 0, with the sigma of its prior, and moves the coefficients
-    back accordingly.
+    into it. The bias is then 0, with the sigma of its prior, and the coefficients move back accordingly.
 
     `samples`: samples of the fit, with its effects subtracted. `bias`, `bias_sigma`: estimated bias of the
     reference, and its prior 1-sigma, nT.
     """
     direction, sigma = _level_direction(calibration, samples)
     if sigma and contradicts(bias, bias_sigma):
-        calibration, direction, sigma = _without_bias(calibration, direction, sigma, bias, bias_sigma)
-        bias = 0.0
+        # a step of `direction` changes the mean of the corrected field by `sigma`
+        factor = max(bias_sigma / sigma, 1.0)
+        calibration = replace(
+            calibration,
+            coefficients=calibration.coefficients - direction * (bias / sigma),
+            covariance=calibration.covariance + (factor**2 - 1.0) * np.outer(direction, direction),
+        )
+        direction, sigma, bias = direction * factor, sigma * factor, 0.0
     known = calibration.reference
     reference = Reference(known.field, known.model, bias, bias_sigma, sigma)
     return replace(calibration, reference=reference, level=tuple(direction.tolist()))
@@ -63,20 +68,6 @@ def _level_direction(calibration: Calibration, samples: ResidualSamples) -> tupl
     Pj = calibration.covariance @ j
     sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
     return Pj / max(sigma, 1e-300), sigma
-
-
-def _without_bias(
-    calibration: Calibration, direction: FloatArray, sigma: float, bias: float, bias_sigma: float
-) -> tuple[Calibration, FloatArray, float]:
-    """Return the calibration for a bias of 0 with its prior sigma, and the level's direction and sigma."""
-    # a step of `direction` changes the mean of the corrected field by `sigma`
-    factor = max(bias_sigma / sigma, 1.0)
-    moved = replace(
-        calibration,
-        coefficients=calibration.coefficients - direction * (bias / sigma),
-        covariance=calibration.covariance + (factor**2 - 1.0) * np.outer(direction, direction),
-    )
-    return moved, direction * factor, sigma * factor
 
 
 def contradicts(bias: float, bias_sigma: float) -> bool:
@@ -194,8 +185,7 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
 def expected_heading_sigma(calibration: Calibration, data: Observations) -> float:
     """Return the RMS over the samples of the magnetic heading's standard deviation, deg.
 
-    Roll and pitch have the `tilt_sigma` of the boresight. The result is NaN without a boresight, or without
-    roll and pitch.
+    Roll and pitch have the `tilt_sigma` of the boresight; NaN without a boresight, or roll and pitch.
     """
     if calibration.boresight is None or data.attitude is None:
         return float("nan")

@@ -144,8 +144,7 @@ class Plan:
     """Runs in the order of flight."""
     rms: tuple[float, ...]
     worst: tuple[float, ...]
-    """`rms`, `worst`: RMS and largest expected error over the mission, nT, before the first run and after
-    each run."""
+    """`rms`, `worst`: RMS and largest expected error over the mission, nT, before any and after each run."""
 
 
 def expected_calibration(

@@ -51,8 +51,7 @@ class Proposal:
     name: str
     rms: float
     worst: float
-    """`rms`, `worst`: RMS and largest 1-sigma of the corrected field over the mission, relative to its mean,
-    nT."""
+    """`rms`, `worst`: RMS and largest 1-sigma of the corrected field about its mean over the mission, nT."""
     crossings: int
     """Number of places that the track passes again on another course."""
     open: tuple[str, ...]
