@@ -82,16 +82,13 @@ def test_sigma_is_the_covariance_carried_through() -> None:
     cal = random_calibration(3)
     field, positions, time = random_samples(4, 4, 2)
     got = correct(cal, field, positions, time)
+    steps = 0.05 * np.eye(cal.coefficients.size)
     for i in range(4):
-        J = np.array(
-            [
-                (
-                    naive(cal, cal.coefficients + 0.05 * e, field[i], positions[i])
-                    - naive(cal, cal.coefficients - 0.05 * e, field[i], positions[i])
-                ) / 0.1
-                for e in np.eye(cal.coefficients.size)
-            ]
-        ).T  # fmt: skip
+        up, down = (
+            np.array([naive(cal, c, field[i], positions[i]) for c in cal.coefficients + sign * steps])
+            for sign in (1.0, -1.0)
+        )
+        J = (up - down).T / 0.1
         A, _ = cal.matrices(positions[i : i + 1])
         V = J @ cal.covariance @ J.T + cal.noise.sensor**2 * A[0] @ A[0].T
         u = got.vector[i] / got.total[i]

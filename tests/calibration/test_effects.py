@@ -37,10 +37,8 @@ P = Parameter("p", "in", -1.0, 1.0, 0.0, 1.0)
 def with_effect(effect: Effect, c: np.ndarray | None = None, of_p: np.ndarray | None = None) -> Calibration:
     """Return a calibration with the term ``(a, T) = of_p p`` (nT) and the effect of coefficients c."""
     coefficients = np.zeros(18 + effect.size)
-    if of_p is not None:
-        coefficients[9:18] = of_p
-    if c is not None:
-        coefficients[18:] = c
+    coefficients[9:18] = 0.0 if of_p is None else of_p
+    coefficients[18:] = 0.0 if c is None else c
     return Calibration(
         parameters=(P,), terms=(Polynomial(exponents=((0,), (1,))),), coefficients=coefficients,
         covariance=np.eye(len(coefficients)), noise=Noise(1.0), reference=Reference(5e4), effects=(effect,),

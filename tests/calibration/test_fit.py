@@ -20,7 +20,6 @@ from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import CalibrationError
 from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.information import GaussianInformation
-from magbridge.estimation.noise import Whitening, whiten
 from magbridge.estimation.optimise import normal_equations
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.estimation.residual import ResidualSamples, residuals
@@ -40,35 +39,16 @@ def survey_error(calibration: Calibration, glider: Glider) -> tuple[float, float
     )
 
 
-def rms_on_survey(calibration: Calibration, glider: Glider) -> float:
-    k = len(calibration.parameters)
-    total = correct(
-        calibration, glider.survey.field, glider.survey.parameters[:, :k], glider.survey.time
-    ).total
-    return float(np.sqrt(np.mean((total - glider.survey.reference) ** 2)))
-
-
-@pytest.fixture
-def some_samples() -> ResidualSamples:
+def test_jacobian_is_the_derivative() -> None:
     rng = np.random.default_rng(1)
     n = 60
-    return ResidualSamples(
-        rng.normal(size=(n, 3)) * 3e4,
-        np.full(n, 5e4),
-        rng.normal(size=(n, 3)),
-        np.where(np.arange(n) % 7 > 0, 1.0, np.inf),
-        5e4,
-        0.5,
-    )
-
-
-def test_jacobian_is_the_derivative(some_samples: ResidualSamples) -> None:
+    field, phi = rng.normal(size=(n, 3)) * 3e4, rng.normal(size=(n, 3))
+    samples = ResidualSamples(field, np.full(n, 5e4), phi, np.ones(n), 5e4, 0.5)
     c = np.random.default_rng(2).normal(size=27) * 2000.0
-    _, g = residuals(some_samples, c)
-    J = (some_samples.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
-    numeric = np.array(
-        [(residuals(some_samples, c + h)[0] - residuals(some_samples, c - h)[0]) / 2 for h in np.eye(27)]
-    ).T
+    _, g = residuals(samples, c)
+    J = (phi[:, :, None] * g[:, None, :]).reshape(n, -1)
+    ends = ((residuals(samples, c + h)[0], residuals(samples, c - h)[0]) for h in np.eye(27))
+    numeric = np.array([0.5 * (up - down) for up, down in ends]).T
     np.testing.assert_allclose(J, numeric, atol=1e-6 * np.abs(J).max())
 
 
@@ -80,14 +60,11 @@ def test_evidence_has_the_slope_it_says(glider: Gliders) -> None:
     quadratic = GaussianInformation.from_derivatives(np.zeros(54), *normal, 2250.0)
     x = np.append(family.centre, np.log(30.0))
     _, slope, *_ = log_evidence(quadratic, family, x[:-1], x[-1])
-    numeric = [
-        (
-            log_evidence(quadratic, family, up[:-1], up[-1])[0]
-            - log_evidence(quadratic, family, dn[:-1], dn[-1])[0]
-        )
-        / 2e-4
-        for up, dn in ((x + h, x - h) for h in 1e-4 * np.eye(len(x)))
-    ]
+
+    def value(x: np.ndarray) -> float:
+        return log_evidence(quadratic, family, x[:-1], x[-1])[0]
+
+    numeric = [(value(x + h) - value(x - h)) / 2e-4 for h in 1e-4 * np.eye(len(x))]
     np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-3)
 
 
@@ -111,31 +88,19 @@ def test_errors_in_variables_take_the_bias_away() -> None:
     assert np.std(off) < 1.6
 
 
-@pytest.mark.parametrize(
-    ("masses", "noise", "memory", "geometry"),
-    [
-        (2, 1.0, 0.0, False),
-        (2, 1.0, 0.0, True),
-        (1, 1.0, 0.0, False),
-        (3, 1.0, 0.0, False),
-        (2, 5.0, 10.0, False),
-    ],
-)
+@pytest.mark.parametrize(("masses", "memory", "geometry"), [
+    (2, 0.0, False), (2, 0.0, True), (1, 0.0, False), (3, 0.0, False), (2, 10.0, False)
+])  # fmt: skip
 def test_auto_is_near_the_noise_floor_out_of_sample(
-    glider: Gliders, masses: int, noise: float, memory: float, geometry: bool
+    glider: Gliders, masses: int, memory: float, geometry: bool
 ) -> None:
     ratios, spreads, correlations = [], [], []
     for seed in range(4 if (masses, memory) == (2, 0.0) else 2):
-        one = glider(seed, masses, noise, memory)
-        rng = np.random.default_rng(seed)
-        vehicle = {
-            name: {
-                "at": (np.array(mass.at) + rng.normal(0, 0.05, 3)).tolist(),
-                "at_sigma": 0.05,
-                "travel": list(mass.travel),
-            }
-            for name, mass in one.vehicle.mass.items()
-        }
+        one = glider(seed, masses, 5.0 if memory else 1.0, memory)
+        vehicle, rng = {}, np.random.default_rng(seed)
+        for name, mass in one.vehicle.mass.items():
+            place = (np.array(mass.at) + rng.normal(0, 0.05, 3)).tolist()
+            vehicle[name] = {"at": place, "at_sigma": 0.05, "travel": list(mass.travel)}
         found = fit(one.runs, vehicle=vehicle if geometry else None)
         ratio, spread = survey_error(found.calibration, one)
         ratios.append(ratio)
@@ -157,9 +122,10 @@ def test_the_paper_s_signature(glider: Gliders) -> None:
     assert by["cubic"].rms < 1.1
     assert by["auto"].rms < 1.1
     assert by["nominal"].rms > 30.0
-    assert rms_on_survey(by["auto"].calibration, one) < 1.3
-    assert rms_on_survey(by["cubic"].calibration, one) > 2.0
-    assert rms_on_survey(by["nominal"].calibration, one) > 20.0
+    ratios = {method: survey_error(found.calibration, one)[0] for method, found in by.items()}
+    assert ratios["auto"] < 1.3
+    assert ratios["cubic"] > 2.0
+    assert ratios["nominal"] > 20.0
 
 
 def test_an_order_that_is_too_low_widens_the_sigma(glider: Gliders) -> None:
@@ -235,10 +201,8 @@ def test_a_collapsed_fit_is_refused() -> None:
     """One circle at one pitch: A and T are not distinguishable, and a free fit diverges."""
     rng = np.random.default_rng(5)
     heading = rng.uniform(0, 2 * np.pi, 400)
-    field = 5e4 * np.column_stack([0.35 * np.cos(heading), 0.35 * np.sin(heading), np.full(400, 0.93)])
-    data = Observations(
-        field * [3.0, 3.0, 3.0] + rng.normal(0, 1, (400, 3)), np.full(400, 5e4), np.empty((400, 0))
-    )
+    field = 15e4 * np.column_stack([0.35 * np.cos(heading), 0.35 * np.sin(heading), np.full(400, 0.93)])
+    data = Observations(field + rng.normal(0, 1, (400, 3)), np.full(400, 5e4), np.empty((400, 0)))
     with pytest.raises(CalibrationError, match=r"collapsed: .* there are too few attitudes"):
         fit(data, "nominal")
 
@@ -280,34 +244,6 @@ def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
     before, after = (correct(c, runs.field, runs.parameters, runs.time) for c in (without, with_bias))
     np.testing.assert_array_equal(before.total, after.total)
     np.testing.assert_allclose(np.sqrt(after.sigma**2 - before.sigma**2), 30.0, rtol=0.01)
-
-
-def test_least_squares_of_the_whitened_is_generalised_least_squares_next_to_gaps_too() -> None:
-    """Compare with the dense inverse covariance of an AR(1) process with lost samples."""
-    rng = np.random.default_rng(2)
-    place = np.flatnonzero(rng.random(120) > 0.2)
-    n, run = len(place), np.arange(len(place)) // 40
-    steps = np.where(np.diff(run, prepend=-1) > 0, np.inf, np.diff(place, prepend=0))
-    X = rng.normal(size=(n, 3)).cumsum(axis=0)
-    C = 0.9 ** np.abs(np.subtract.outer(place, place)) * np.equal.outer(run, run)
-    white = whiten(X, steps, 0.9)
-    np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
-
-
-def test_slow_and_white_noise_are_whitened_in_any_blocks() -> None:
-    """Compare with the dense inverse covariance; processing in blocks gives the same as at once."""
-    rng = np.random.default_rng(3)
-    place = np.flatnonzero(rng.random(150) > 0.2)
-    run = np.arange(len(place)) // 45
-    steps = np.where(np.diff(run, prepend=-1) > 0, np.inf, np.diff(place, prepend=0))
-    X = rng.normal(size=(len(place), 3)).cumsum(axis=0)
-    C = 0.7 * 0.95 ** np.abs(np.subtract.outer(place, place)) * np.equal.outer(run, run)
-    C += 0.3 * np.eye(len(place))
-    white = whiten(X, steps, 0.95, 0.3)
-    np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
-    whitening = Whitening(steps, 0.95, 0.3)
-    np.testing.assert_allclose(np.vstack([whitening.apply(part) for part in np.array_split(X, 7)]), white)
-    assert np.log(whitening.variance).sum() == pytest.approx(np.linalg.slogdet(C)[1])
 
 
 def test_what_the_model_lacks_is_in_its_sigmas(glider: Gliders) -> None:

@@ -22,7 +22,7 @@ from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.fitting.uncertainty import apart_from_level, level_of, with_level
 from magbridge.calibration.model import Noise, identity
 from magbridge.constants import MAIN_FIELD_SIGMA_NT
-from magbridge.diagnostics import Diagnostic
+from magbridge.estimation.residual import rms
 from magbridge.survey.gridding import gridded
 from magbridge.survey.samples import Samples
 
@@ -47,8 +47,7 @@ def flown(
     pitch = np.radians(np.where(leg % 2, 25, -25) + rng.normal(0, 1, n))
     roll = np.radians(rng.normal(0, 5, legs)[leg] + rng.normal(0, 1, n))
     place = np.cumsum(speed * dt * np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0)
-    k, phase = rng.normal(0, 1 / 700.0, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
-    rock = 40.0 * np.sqrt(2 / 400) * np.cos(place[:, :2] @ k.T + phase).sum(axis=1)
+    rock = waves(place, 700.0, 40.0, rng)
     F_0 = float(np.linalg.norm(MAIN))
     true = F_0 + rock
     ned = MAIN * (true / F_0)[:, None]
@@ -60,6 +59,12 @@ def flown(
         reference_ned=np.tile(MAIN, (n, 1)), place=place, unmapped=np.ones(n),
     )  # fmt: skip
     return data, true
+
+
+def waves(place: FloatArray, length: float, amplitude: float, rng: np.random.Generator) -> FloatArray:
+    """Return a random field (n,), nT, of 400 waves at places (n, 2+), m."""
+    k, phase = rng.normal(0, 1 / length, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
+    return np.asarray(amplitude * np.sqrt(2 / 400) * np.cos(place[:, :2] @ k.T + phase).sum(axis=1))
 
 
 def error_of(found: Fit, data: Observations, true: FloatArray) -> tuple[float, float]:
@@ -79,39 +84,26 @@ def survey() -> Survey:
     return data, true, fit(data)
 
 
-def test_field_about_its_mean(survey: Survey) -> None:
-    """The corrected field reaches the noise, and its sigma without the bias agrees."""
+def test_field_level_and_crust_of_a_survey(survey: Survey) -> None:
     data, true, found = survey
+    # the corrected field about its mean reaches the noise, and its sigma without the bias agrees
     assert found.calibration.method == "survey"
-    got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
-    error = got.total - true
-    assert np.std(error) < 1.15 * NOISE
-    level = level_of(found.calibration, data.field, np.empty((len(data), 0)), data.time)
-    apart = np.sqrt(got.sigma**2 - level**2)
-    assert 0.8 < np.std(error) / np.median(apart) < 1.25
-
-
-def test_parts_are_predicted_from_the_others_to_the_noise(survey: Survey) -> None:
-    found = survey[2]
+    error, sigma = error_of(found, data, true)
+    assert error < 1.15 * NOISE
+    assert 0.8 < error / sigma < 1.25
+    # parts are predicted from the others to the noise, which is the sensor's
     assert found.details["left_out_nT"] == pytest.approx(found.calibration.noise.sensor, rel=0.3)
-
-
-def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
-    """An IGRF does not determine the bias: sigma includes this uncertainty, and the result states it."""
-    data, true, found = survey
+    assert found.calibration.noise.sensor == pytest.approx(NOISE, rel=0.1)
+    # an IGRF does not determine the bias: sigma includes this uncertainty, and the result states it
     level = found.calibration.reference.level_sigma
     assert 0.8 * MAIN_FIELD_SIGMA_NT < level < 1.5 * MAIN_FIELD_SIGMA_NT
     got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
     assert got.sigma.min() > 0.9 * level
     assert abs(np.mean(got.total - true)) < 2.5 * level
-
-
-def test_crustal_field_is_not_taken_for_noise(survey: Survey) -> None:
-    """The estimated amplitude and length are the crustal field's; the noise is the sensor's."""
-    rock = survey[2].details["crustal_field"]
+    # amplitude and length are the crustal field's
+    rock = found.details["crustal_field"]
     assert 20.0 < rock["amplitude_nT"] < 100.0
     assert 300.0 < rock["length_m"] < 2000.0
-    assert survey[2].calibration.noise.sensor == pytest.approx(NOISE, rel=0.1)
 
 
 def test_a_field_larger_than_any_crust_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,34 +196,27 @@ def test_a_zigzag_separates_crustal_field_and_heading_without_a_crossing() -> No
     assert 0.8 < error / sigma < 1.25
 
 
-def test_a_jump_in_position_is_left_out_and_reported() -> None:
-    """A fix on the other side of the Earth must not spread the nodes there."""
+@pytest.mark.parametrize("code", ["far_position", "without_position", "position_jumps"])
+def test_positions_that_are_wrong_or_missing_are_reported(code: str) -> None:
+    """A fix on the other side of the Earth does not spread the nodes there, and a gap is not a jump."""
     data, true = flown(legs=8)
     assert data.place is not None
     place = data.place.copy()
-    place[100:103, 0] += 8e6
-    found = fit(replace(data, place=place))
+    place[100:103, 0] += 8e6 * (code == "far_position")
+    place[300:350] += np.nan if code == "without_position" else 0.0
+    place[500:, 0] += 600.0 * (code == "position_jumps")
+    found = fit(replace(data, place=place), "auto" if code == "far_position" else "survey")
+    (warning,) = (one for one in found.warnings if one.code in ("far_position", "without_position", code))
+    assert warning.code == code
+    if code == "position_jumps":
+        assert warning.values["step_m"] == pytest.approx(605.0, abs=5.0)
+        assert "--position-sigma" in warning.text
+    else:
+        lost = {"far_position": 3, "without_position": 50}[code]
+        assert warning.values == {"samples": f"{lost} samples"}
+        assert sum(run.samples for run in found.calibration.runs) == len(data) - lost
     error, sigma = error_of(found, data, true)
-    assert 0.8 < error / sigma < 1.25
-    assert Diagnostic("far_position", {"samples": "3 samples"}) in found.warnings
-    assert sum(run.samples for run in found.calibration.runs) == len(data) - 3
-
-
-def test_samples_without_a_position_are_distinguished_from_a_jump() -> None:
-    """A gap in the positions does not count as a jump; a fix that moves the rest of the track does."""
-    data, true = flown(legs=8)
-    assert data.place is not None
-    hole, moved = data.place.copy(), data.place.copy()
-    hole[300:350] = np.nan
-    moved[500:, 0] += 600.0
-    holed, jumped = (fit(replace(data, place=place), "survey") for place in (hole, moved))
-    assert Diagnostic("without_position", {"samples": "50 samples"}) in holed.warnings
-    (jump,) = (one for one in jumped.warnings if one.code == "position_jumps")
-    assert jump.values["step_m"] == pytest.approx(605.0, abs=5.0)
-    assert "--position-sigma" in jump.text
-    for found in (holed, jumped):
-        error, sigma = error_of(found, data, true)
-        assert error < 1.25 * sigma
+    assert error < 1.25 * sigma
 
 
 def test_two_vehicles_in_one_log_are_not_supported() -> None:
@@ -248,10 +233,8 @@ def test_two_vehicles_in_one_log_are_not_supported() -> None:
 
 def over(data: Observations, length: float) -> Observations:
     """Return the data with a further crustal field of 30 nT and a `length`, m."""
-    rng = np.random.default_rng(0)
     assert data.place is not None
-    k, phase = rng.normal(0, 1 / length, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
-    rock = 30.0 * np.sqrt(2 / 400) * np.cos(data.place[:, :2] @ k.T + phase).sum(axis=1)
+    rock = waves(data.place, length, 30.0, np.random.default_rng(0))
     return replace(data, field=data.field * (1.0 + rock / np.linalg.norm(data.field, axis=1))[:, None])
 
 
@@ -356,9 +339,7 @@ def test_creep_of_the_offset_goes_neither_into_the_field_nor_into_the_map() -> N
     seen = replace(data, field=data.field + creep)
     found = fit(seen)
     assert found.creep is not None
-    assert np.sqrt(np.mean((found.creep.offset_at(data.time) - creep) ** 2)) < 0.4 * np.sqrt(
-        np.mean(creep**2)
-    )
+    assert rms(found.creep.offset_at(data.time) - creep) < 0.4 * rms(creep)
     still = found.creep.calibration
     value = correct(still, seen.field - found.creep.offset_at(data.time), data.parameters, data.time).total
     n = len(data)
@@ -383,9 +364,7 @@ def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
     found = fit(replace(data, field=data.field + jump))
     assert found.creep is not None
     moved = jump - jump.mean(axis=0)
-    assert np.sqrt(np.mean((found.creep.offset_at(data.time) - moved) ** 2)) < 0.5 * np.sqrt(
-        np.mean(moved**2)
-    )
+    assert rms(found.creep.offset_at(data.time) - moved) < 0.5 * rms(moved)
     assert 350.0 < found.details["crustal_field"]["length_m"] < 1400.0
     error, sigma = error_of(found, data, true)
     assert error > 2.0 * NOISE
@@ -403,11 +382,8 @@ def circles(disturbed: float) -> Observations:
     rng = np.random.default_rng(3)
     n = 600
     angle = np.linspace(0.0, 8.0 * np.pi, n)
-    heading, roll, pitch = (
-        angle + 0.3 * np.sin(5 * angle),
-        0.5 * np.sin(angle * 1.7),
-        0.4 * np.sin(angle * 2.3),
-    )
+    heading, roll = angle + 0.3 * np.sin(5 * angle), 0.5 * np.sin(angle * 1.7)
+    pitch = 0.4 * np.sin(angle * 2.3)
     turned = Rotation.from_euler("ZYX", np.column_stack([heading, pitch, roll])).inv().apply(EARTH)
     slow = np.cumsum(rng.normal(size=(n, 3)), axis=0)
     slow = disturbed * slow / slow.std(axis=0)

@@ -1,5 +1,7 @@
 """Test the observations that are made from a deployment's columns."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -20,13 +22,9 @@ from magbridge.field.reference import with_true_heading
 def test_a_deployment_s_columns_become_observations() -> None:
     n = 50
     rng = np.random.default_rng(0)
-    columns: dict[str, tuple[object, ...]] = {
-        f"mag_{axis}": ("time", rng.normal(0, 3e4, n)) for axis in "xyz"
-    }
-    columns |= {
-        "battpos": ("time", rng.normal(0, 1, n), {"units": "in"}),
-        "reference_field": ("time", np.full(n, 5e4)),
-    }
+    columns: dict[str, Any] = {f"mag_{axis}": ("time", rng.normal(0, 3e4, n)) for axis in "xyz"}
+    columns["battpos"] = "time", rng.normal(0, 1, n), {"units": "in"}
+    columns["reference_field"] = "time", np.full(n, 5e4)
     ds = xr.Dataset(columns, coords={"time": np.arange(n) * 4.0})
     data = observations(ds, ["battpos"])
     assert data.names == ("battpos",) == observations(ds, "battpos").names
@@ -126,9 +124,7 @@ def test_a_turning_field_has_its_length_again(step: float, noise: float) -> None
     rows = slice(round(20.0 / fine), None, round(step / fine))
     field = slow[rows] + np.random.default_rng(0).normal(0.0, noise, slow[rows].shape)
     F = float(np.linalg.norm(true[0]))
-    data = Observations(
-        field=field, reference=np.full(len(field), F), parameters=np.empty((len(field), 0)), time=t[rows]
-    )
+    data = Observations(field, np.full(len(field), F), np.empty((len(field), 0)), time=t[rows])
     inside = slice(60, -60)
     before, after = (
         np.linalg.norm(part.field, axis=1)[inside] - F for part in (data, unfiltered(data, CORNER))
@@ -142,15 +138,13 @@ def test_a_turning_field_has_its_length_again(step: float, noise: float) -> None
 def test_slopes_stay_within_their_run() -> None:
     field = np.tile([[20_000.0, 0.0, 45_000.0]], (40, 1))
     field[20:, 0] *= -1.0
-    data = Observations(
-        field=field, reference=np.full(40, 49_244.0), parameters=np.empty((40, 0)), runs=np.arange(40) // 20
-    )
+    data = Observations(field, np.full(40, 49_244.0), np.empty((40, 0)), runs=np.arange(40) // 20)
     assert np.array_equal(unfiltered(data, CORNER).field, field)
 
 
 @pytest.mark.parametrize("corner", [1e-320, 1e-9, 0.004])
 def test_a_filter_slower_than_the_data_is_refused(corner: float) -> None:
     field = np.tile([[20_000.0, 0.0, 45_000.0]], (40, 1))
-    data = Observations(field=field, reference=np.full(40, 49_244.0), parameters=np.empty((40, 0)))
+    data = Observations(field, np.full(40, 49_244.0), np.empty((40, 0)))
     with pytest.raises(CalibrationError, match=r"is longer than the data \(39 s\)"):
         unfiltered(data, corner)

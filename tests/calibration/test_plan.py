@@ -152,43 +152,40 @@ def test_gusts_on_lines_of_four_headings_are_not_a_box(seed: int) -> None:
     assert len(found.manoeuvres) >= 10
 
 
+def flown_box(seed: int, noise: float, wander: float = 0.0) -> ScalarSeries:
+    """Return a box flight with a permanent field of 374 nT, and `noise` (nT) of the scalar sensor."""
+    random, earth = np.random.default_rng(seed), np.array([17_000.0, -3_500.0, 51_000.0])
+    time, angles, _ = box()
+    angles = angles + wander * np.sin(time[:, None] / np.array([13.0, 17.0, 31.0]))
+    u = Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).inv().apply(earth)
+    scalar = np.linalg.norm(u + np.array([300.0, -200.0, 100.0]), axis=1) + random.normal(0, noise, len(u))
+    known, nothing = np.full(len(u), np.linalg.norm(earth)), np.empty((len(u), 0))
+    vector = u + random.normal(0, 1.0, u.shape)
+    return ScalarSeries(time + 1.6e9, scalar, vector, known, nothing, np.full(len(u), np.nan))
+
+
 def test_a_box_that_was_not_fitted_is_within_0_05_nt_of_a_fit_to_it() -> None:
-    earth = np.array([17_000.0, -3_500.0, 51_000.0])
     time, angles, _ = box()
     manoeuvres = box_flight(time, *angles.T)
     assert manoeuvres is not None
-    wander = 0.3 * np.sin(time[:, None] / np.array([13.0, 17.0, 31.0]))
-    u = Rotation.from_euler("ZYX", (angles + wander)[:, ::-1], degrees=True).inv().apply(earth)
-
-    def flown(seed: int) -> ScalarSeries:
-        random = np.random.default_rng(seed)
-        scalar = np.linalg.norm(u + np.array([300.0, -200.0, 100.0]), axis=1)
-        scalar += random.normal(0, 0.02, len(u))
-        known, nothing = np.full(len(u), np.linalg.norm(earth)), np.empty((len(u), 0))
-        vector = u + random.normal(0, 1.0, u.shape)
-        return ScalarSeries(time + 1.6e9, scalar, vector, known, nothing, np.full(len(u), np.nan))
+    one, two = (flown_box(seed, 0.02, wander=0.3) for seed in (1, 2))
 
     def merit(fitted: ScalarSeries, tested: ScalarSeries) -> float:
         after = correct_scalar(fit_scalar(fitted, (), map_known=True).sensor, tested).field
         before, after = tested.scalar - tested.reference, after - tested.reference
         return float(figure_of_merit(manoeuvres, before, after)["after_nT"])
 
-    assert merit(flown(1), flown(2)) - merit(flown(2), flown(2)) < 0.05
+    assert merit(one, two) - merit(two, two) < 0.05
 
 
 def test_calibrate_prints_the_figure_of_merit(tmp_path: Path, command: Command) -> None:
-    time, angles, _ = box()
-    random = np.random.default_rng(1)
-    earth = np.array([17_000.0, -3_500.0, 51_000.0])
-    u = Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).inv().apply(earth)
-    vector = u + random.normal(0, 1.0, u.shape)
-    scalar = np.linalg.norm(u + np.array([300.0, -200.0, 100.0]), axis=1) + random.normal(0, 0.05, len(u))
-    columns = {f"mag_{axis}": (vector[:, k], "nT") for k, axis in enumerate("xyz")}
+    series, angles = flown_box(1, 0.05), box()[1]
+    columns = {f"mag_{axis}": (series.vector[:, k], "nT") for k, axis in enumerate("xyz")}
     columns |= {name: (angles[:, k], "deg") for k, name in enumerate(("roll", "pitch", "heading"))}
-    columns |= {"tail": (scalar, "nT"), "reference_field": (np.full(len(u), np.linalg.norm(earth)), "nT")}
+    columns |= {"tail": (series.scalar, "nT"), "reference_field": (series.reference, "nT")}
     ds = xr.Dataset(
         {name: ("time", values, {"units": units}) for name, (values, units) in columns.items()},
-        coords={"time": time + 1.6e9},
+        coords={"time": series.time},
     )
     log, cal = tmp_path / "box.nc", tmp_path / "cal.json"
     logs.write(ds, log)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.linalg import solve_discrete_are
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import magbridge as mb
@@ -26,174 +25,33 @@ from magbridge.calibration.fitting.scalar_log import _without_repeated, with_sca
 from magbridge.calibration.model import identity
 from magbridge.calibration.scalar import (
     ScalarQuality,
+    ScalarSensor,
     ScalarSeries,
+    SensorDisagreement,
     compare_sensors,
     correct_scalar,
     scalar_design,
 )
 from magbridge.cli import main
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from magbridge.records import Quality
 
-Halves = tuple[ScalarSeries, ScalarSeries, FloatArray]
-
-NAMES = ("current", "aileron", "step")
-
-
-def _smooth(random: np.random.Generator, n: int, samples: float) -> FloatArray:
-    """Return a smooth random series, (n,), of standard deviation 1 and mean 0."""
-    a = np.exp(-1.0 / samples)
-    series = lfilter([1.0], [1.0, -a], random.normal(size=n + int(10 * samples)))[-n:]
-    series = lfilter([1.0], [1.0, -a], series)
-    return np.asarray((series - series.mean()) / series.std(), float)
-
-
-def _flight(seed: int, minutes: float = 40.0, rate: float = 2.0) -> tuple[ScalarSeries, FloatArray]:
-    """Return a flight of eight headings, built with vectors instead of the model's columns."""
-    random = np.random.default_rng(seed)
-    n = int(minutes * 60.0 * rate)
-    time = np.arange(n) / rate
-    yaw = 45.0 * (time // 150.0) + 3.0 * _smooth(random, n, 5.0 * rate)
-    pitch, roll = 3.0 * _smooth(random, n, 4.0 * rate), 6.0 * _smooth(random, n, 3.0 * rate)
-    crust = 30.0 * _smooth(random, n, 20.0 * rate)
-    north_east_down = np.array([17_000.0, -3_500.0, 51_000.0])
-    main = np.linalg.norm(north_east_down)
-    truth = main + crust
-    attitude = Rotation.from_euler("ZYX", np.radians(np.column_stack([yaw, pitch, roll])))
-    earth = attitude.inv().apply(north_east_down * (truth / main)[:, None])
-    u = earth / truth[:, None]
-    channels = np.column_stack([
-        5.0 + 3.0 * _smooth(random, n, 60.0 * rate),
-        2.0 * roll + _smooth(random, n, 2.0 * rate),
-        np.where(time > 0.6 * time[-1], 4.0, 0.0) + 0.1 * _smooth(random, n, 5.0 * rate),
-    ])  # fmt: skip
-    induced = random.normal(0.0, 60.0, (3, 3))
-    body = earth + random.normal(0.0, 600.0, 3) + u @ (induced + induced.T) / 2.0
-    body += channels @ (random.normal(size=(3, 3)) * np.array([[3.0], [0.3], [1.0]]))
-    scalar = np.linalg.norm(body, axis=1) + random.normal(0.0, 0.3, n) + 12.0
-    vector = earth + random.normal(0.0, 1.0, earth.shape)
-    series = ScalarSeries(time + 1.6e9, scalar, vector, truth.copy(), channels, np.full(n, np.nan))
-    return series, truth
-
-
-def _part(series: ScalarSeries, rows: slice) -> ScalarSeries:
-    return ScalarSeries(*(values[rows] for values in series))
-
-
-@pytest.fixture(scope="module")
-def halves() -> Halves:
-    series, truth = _flight(3)
-    first, second = slice(0, len(truth) // 2), slice(len(truth) // 2, None)
-    return _part(series, first), _part(series, second), truth[second]
-
-
-@pytest.fixture(scope="module")
-def fitted(halves: Halves) -> ScalarFit:
-    return fit_scalar(halves[0], NAMES, column="scalar", map_known=True)
-
-
-def test_noise_without_a_whitening_filter_is_not_chosen(
-    halves: Halves, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The Riccati equation of extreme noise is ill-conditioned: scipy then raises ValueError."""
-    calls = count()
-
-    def sometimes(*arguments: Any) -> FloatArray:
-        if next(calls) % 7 == 3:
-            raise ValueError("ill-conditioned")
-        return np.asarray(solve_discrete_are(*arguments))
-
-    monkeypatch.setattr(scalar_fit, "solve_discrete_are", sometimes)
-    found = fit_scalar(_part(halves[0], slice(0, 1200)), NAMES, map_known=True)
-    assert found.rms_after < 0.1 * found.rms_before
-
-
-def test_other_half_beats_least_squares_with_a_true_sigma(halves: Halves, fitted: ScalarFit) -> None:
-    first, second, truth = halves
-    corrected = correct_scalar(adapt_to_log(fitted.sensor, second.channels), second)
-    error = corrected.field - truth
-    rms = np.sqrt(np.mean(error**2))
-
-    # Tolles-Lawson by least squares: permanent, induced, eddy and a constant.
-    def design(part: ScalarSeries) -> FloatArray:
-        columns = scalar_design(part, fitted.sensor.channels, fitted.sensor.reference_field)[:, :18]
-        return np.column_stack([columns, np.ones(len(columns))])
-
-    solution = np.linalg.lstsq(design(first), first.scalar - first.reference, rcond=1e-10)[0]
-    least_squares = second.scalar - design(second) @ solution - truth
-    assert rms < 3.0
-    assert rms < 0.5 * np.sqrt(np.mean(least_squares**2))
-    assert 0.4 < np.sqrt(np.mean((error / corrected.sigma) ** 2)) < 1.6
-
-
-def test_channel_that_did_not_move_in_the_fit_has_a_wide_sigma(halves: Halves, fitted: ScalarFit) -> None:
-    _, second, _ = halves
-    corrected = correct_scalar(adapt_to_log(fitted.sensor, second.channels), second)
-    after = second.channels[:, 2] > 2.0
-    assert corrected.extrapolated[after].all()
-    assert np.median(corrected.sigma[after]) > 1.5 * np.median(corrected.sigma[~after])
-
-
-def test_missing_telemetry_is_not_corrected(halves: Halves, fitted: ScalarFit) -> None:
-    _, second, _ = halves
-    channels = second.channels.copy()
-    channels[5, 0] = np.nan
-    corrected = correct_scalar(fitted.sensor, second._replace(channels=channels))
-    assert np.isnan(corrected.field[5])
-    assert np.isinf(corrected.sigma[5])
-    assert corrected.missing[5]
-    assert not corrected.missing[6:].any()
-
-
-def test_wrong_number_of_channels_and_too_few_samples(halves: Halves, fitted: ScalarFit) -> None:
-    first, second, _ = halves
-    with pytest.raises(CalibrationError, match="expected 3 channels"):
-        correct_scalar(fitted.sensor, second._replace(channels=second.channels[:, :1]))
-    with pytest.raises(CalibrationError, match="expected at least 100 samples"):
-        fit_scalar(_part(first, slice(0, 50)), NAMES)
-
-
-def test_a_source_that_no_channel_shows_is_left_out_of_the_fit(halves: Halves, fitted: ScalarFit) -> None:
-    first, second, truth = halves
-    scalar = first.scalar.copy()
-    scalar[1500:1600] -= 3_000.0
-    found = fit_scalar(first._replace(scalar=scalar), NAMES, map_known=True)
-    error = correct_scalar(adapt_to_log(found.sensor, second.channels), second).field - truth
-    assert np.sqrt(np.mean(error**2)) < 3.0
-    assert found.rms_after < 1.5 * fitted.rms_after
-
-
-def test_without_a_map_it_beats_ridge_with_a_true_sigma() -> None:
-    # The start of the log has no special part: the crustal field there is not taken for the level.
-    series, truth = _flight(12)
-    first, second = slice(0, len(truth) // 2), slice(len(truth) // 2, None)
-    train, test = _part(series, first), _part(series, second)
-    train = train._replace(reference=np.full(len(train.time), np.median(truth)))
-    found = fit_scalar(train, NAMES)
-    corrected = correct_scalar(adapt_to_log(found.sensor, test.channels), test)
-    error = corrected.field - truth[second]
-
-    def design(part: ScalarSeries) -> FloatArray:
-        columns = scalar_design(part, found.sensor.channels, found.sensor.reference_field)[:, :18]
-        return np.column_stack([columns, np.ones(len(columns))])
-
-    A = design(train)
-    solution = np.linalg.solve(A.T @ A + 0.025 * np.eye(A.shape[1]), A.T @ (train.scalar - train.reference))
-    ridge = test.scalar - design(test) @ solution - truth[second]
-    assert np.sqrt(np.mean(error**2)) < min(15.0, float(np.sqrt(np.mean(ridge**2))))
-    assert 0.2 < np.sqrt(np.mean((error / corrected.sigma) ** 2)) < 1.8
-
-
-# ---- Files, commands, and the check of one sensor by the other ---------------------------------------------
-
-
+Halves = tuple[ScalarSeries, ScalarSeries]
 RATE, MINUTES = 4.0, 24
 CHANNELS = "motor_current", "relay", "rudder"
 SCALAR = "mag_cabin"
 
 
-def flown(seed: int, noise: float = 0.3) -> ScalarSeries:
-    """Return a simulated flight over a known field, with dipoles and currents independent of the model."""
+FIRST, SECOND = slice(int(MINUTES * 30 * RATE)), slice(int(MINUTES * 30 * RATE), None)
+"""Halves of a flight."""
+
+
+def flown(seed: int, rows: slice = slice(None), *, relay: bool = True) -> ScalarSeries:
+    """Return a simulated flight over a known field, with dipoles and currents independent of the model.
+
+    `relay`: False if it is off during the first half of the flight.
+    """
     random = np.random.default_rng(seed)
     n = int(MINUTES * 60 * RATE)
     t = np.arange(n) / RATE
@@ -209,21 +67,118 @@ def flown(seed: int, noise: float = 0.3) -> ScalarSeries:
     earth = np.array([17_000.0, -3_500.0, 51_000.0])
     total = np.linalg.norm(earth) + 30.0 * slow(20.0)
     u = Rotation.from_euler("ZYX", angles, degrees=True).inv().apply(earth / np.linalg.norm(earth))
-    channels = np.column_stack([5 + 3 * slow(60), (np.sin(t / 50) > 0.3) * 2.0, 8 * slow(2)])
+    on = (np.sin(t / 50) > 0.3) & (relay | (t > 0.5 * t[-1]))
+    channels = np.column_stack([5 + 3 * slow(60), 2.0 * on, 8 * slow(2)])
     body = u * total[:, None] + [400.0, -250.0, 600.0]
     body += u * total[:, None] @ np.diag([2e-3, -1e-3, 1.5e-3])
     body += np.gradient(u, t, axis=0) @ random.normal(0, 8, (3, 3)).T
     body += channels @ np.array([[3.0, -2.0, 4.0], [6.0, 5.0, -3.0], [0.3, 0.2, -0.4]])
     flicker = np.cumsum(random.normal(0, 0.01, n))
-    scalar = np.linalg.norm(body, axis=1) + noise * random.normal(size=n) + flicker - flicker.mean() + 5.0
+    scalar = np.linalg.norm(body, axis=1) + 0.3 * random.normal(size=n) + flicker - flicker.mean() + 5.0
     vector = u * total[:, None] + random.normal(0, 1.0, (n, 3))
-    return ScalarSeries(t + 1.6e9, scalar, vector, total, channels, np.full(n, np.nan))
+    return part(ScalarSeries(t + 1.6e9, scalar, vector, total, channels, np.full(n, np.nan)), rows)
 
 
-def half(series: ScalarSeries, second: bool) -> ScalarSeries:
-    middle = len(series.time) // 2
-    rows = slice(middle, None) if second else slice(middle)
-    return ScalarSeries(*(column[rows] for column in series))
+def part(series: ScalarSeries, rows: slice) -> ScalarSeries:
+    return ScalarSeries(*(values[rows] for values in series))
+
+
+@pytest.fixture(scope="module")
+def halves() -> tuple[ScalarSeries, ScalarSeries]:
+    series = flown(3, relay=False)
+    return part(series, FIRST), part(series, SECOND)
+
+
+@pytest.fixture(scope="module")
+def fitted(halves: Halves) -> ScalarFit:
+    return fit_scalar(halves[0], CHANNELS, column=SCALAR, map_known=True)
+
+
+def test_noise_without_a_whitening_filter_is_not_chosen(
+    halves: Halves, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The Riccati equation of extreme noise is ill-conditioned: scipy then raises ValueError."""
+    calls = count()
+
+    def sometimes(*arguments: Any) -> FloatArray:
+        if next(calls) % 7 == 3:
+            raise ValueError("ill-conditioned")
+        return np.asarray(solve_discrete_are(*arguments))
+
+    monkeypatch.setattr(scalar_fit, "solve_discrete_are", sometimes)
+    found = fit_scalar(part(halves[0], slice(0, 1200)), CHANNELS, map_known=True)
+    assert found.rms_after < 0.1 * found.rms_before
+
+
+def rms_of_least_squares(
+    fit: ScalarSeries, test: ScalarSeries, sensor: ScalarSensor, ridge: float = 0.0
+) -> float:
+    """Return the error, nT, of a compensation of Tolles and Lawson with a constant, without channels."""
+
+    def design(series: ScalarSeries) -> FloatArray:
+        columns = scalar_design(series, sensor.channels, sensor.reference_field)[:, :18]
+        return np.column_stack([columns, np.ones(len(columns))])
+
+    A = design(fit)
+    penalty = ridge * np.eye(A.shape[1])
+    solution = np.linalg.lstsq(A.T @ A + penalty, A.T @ (fit.scalar - fit.reference), rcond=1e-12)[0]
+    return rms(test.scalar - design(test) @ solution - test.reference)
+
+
+def test_other_half_beats_least_squares_with_a_true_sigma(halves: Halves, fitted: ScalarFit) -> None:
+    first, second = halves
+    corrected = correct_scalar(adapt_to_log(fitted.sensor, second.channels), second)
+    error = corrected.field - second.reference
+    assert rms(error) < 4.0
+    assert rms(error) < 0.5 * rms_of_least_squares(first, second, fitted.sensor)
+    assert 0.4 < rms(error / corrected.sigma) < 1.6
+    # the relay was not on in the fit
+    on = second.channels[:, 1] > 0.0
+    assert corrected.extrapolated[on].all()
+    assert np.median(corrected.sigma[on]) > 1.5 * np.median(corrected.sigma[~on])
+
+
+def test_missing_telemetry_is_not_corrected(halves: Halves, fitted: ScalarFit) -> None:
+    _, second = halves
+    channels = second.channels.copy()
+    channels[5, 0] = np.nan
+    corrected = correct_scalar(fitted.sensor, second._replace(channels=channels))
+    assert np.isnan(corrected.field[5])
+    assert np.isinf(corrected.sigma[5])
+    assert corrected.missing[5]
+    assert not corrected.missing[6:].any()
+
+
+def test_wrong_number_of_channels_and_too_few_samples(halves: Halves, fitted: ScalarFit) -> None:
+    first, second = halves
+    with pytest.raises(CalibrationError, match="expected 3 channels"):
+        correct_scalar(fitted.sensor, second._replace(channels=second.channels[:, :1]))
+    with pytest.raises(CalibrationError, match="expected at least 100 samples"):
+        fit_scalar(part(first, slice(0, 50)), CHANNELS)
+
+
+def test_a_source_that_no_channel_shows_is_left_out_of_the_fit(halves: Halves, fitted: ScalarFit) -> None:
+    first, second = halves
+    scalar = first.scalar.copy()
+    scalar[1500:1600] -= 3_000.0
+    found = fit_scalar(first._replace(scalar=scalar), CHANNELS, map_known=True)
+    error = correct_scalar(adapt_to_log(found.sensor, second.channels), second).field - second.reference
+    assert rms(error) < 4.0
+    assert found.rms_after < 1.5 * fitted.rms_after
+
+
+def test_without_a_map_it_beats_ridge_with_a_true_sigma() -> None:
+    # The start of the log has no special part: the crustal field there is not taken for the level.
+    first, second = flown(12, FIRST), flown(12, SECOND)
+    first = first._replace(reference=np.full(len(first.time), np.median(second.reference)))
+    found = fit_scalar(first, CHANNELS)
+    corrected = correct_scalar(adapt_to_log(found.sensor, second.channels), second)
+    error = corrected.field - second.reference
+    assert rms(error) < min(15.0, rms_of_least_squares(first, second, found.sensor, ridge=0.025))
+    assert 0.2 < rms(error / corrected.sigma) < 1.8
+
+
+# ---- Files, commands, and the check of one sensor by the other ---------------------------------------------
 
 
 def test_a_disturbance_that_no_channel_shows_is_seen_by_the_vector() -> None:
@@ -232,19 +187,19 @@ def test_a_disturbance_that_no_channel_shows_is_seen_by_the_vector() -> None:
     random = np.random.default_rng(3)
     scalar, total = truth + random.normal(0, 0.5, n), truth + random.normal(0, 5.0, n)
     scalar[100:160] -= 3_000.0
-    seen = compare_sensors(scalar, np.full(n, 0.5), total, np.full(n, 5.0), truth)
+    one, five, unknown = np.full(n, 0.5), np.full(n, 5.0), np.full(n, np.nan)
+
+    def compared(reference: FloatArray, rows: slice = slice(None)) -> SensorDisagreement:
+        return compare_sensors(scalar[rows], one[rows], total[rows], five[rows], reference[rows])
+
+    seen = compared(truth)
     assert seen.disagrees[100:160].all()
     assert seen.disagrees[:100].mean() < 0.01
     assert (np.sqrt(seen.scalar_variance[100:160]) > 2_900.0).all()
     assert (seen.vector_variance[100:160] == 0.0).all()  # the reference tells which one is off
-    assert seen.jump[100]
-    assert seen.jump[160]
-    unknown = compare_sensors(scalar, np.full(n, 0.5), total, np.full(n, 5.0), np.full(n, np.nan))
-    assert (unknown.vector_variance[100:160] == 0.0).all()  # so do the samples before and after
-    first = slice(100, 160)
-    alone = compare_sensors(
-        scalar[first], np.full(60, 0.5), total[first], np.full(60, 5.0), np.full(60, np.nan)
-    )
+    assert seen.jump[[100, 160]].all()
+    assert (compared(unknown).vector_variance[100:160] == 0.0).all()  # so do the samples before and after
+    alone = compared(unknown, slice(100, 160))
     assert (alone.vector_variance > 0.0).all()
     assert (alone.scalar_variance > 0.0).all()
 
@@ -269,7 +224,7 @@ def test_a_disturbance_that_cancels_the_crust_is_not_taken_for_the_truth() -> No
 
 @pytest.mark.filterwarnings("error")
 def test_channels_that_disturb_are_named_and_an_idle_one_is_not() -> None:
-    series = half(flown(6), False)
+    series = flown(6, FIRST)
     idle = np.random.default_rng(1).normal(size=len(series.time))
     series = series._replace(channels=np.column_stack([series.channels, idle]))
     found = fit_scalar(series, (*CHANNELS, "fan"), map_known=True).findings
@@ -279,17 +234,17 @@ def test_channels_that_disturb_are_named_and_an_idle_one_is_not() -> None:
 
 
 def test_samples_of_one_time_are_fitted_and_corrected() -> None:
-    series = half(flown(8), False)
+    series = flown(8, FIRST)
     pairs = np.repeat(np.arange(len(series.time)), 1 + (np.arange(len(series.time)) % 7 == 0))
     twice = ScalarSeries(*(column[pairs] for column in series))
     found = fit_scalar(twice, CHANNELS, map_known=True)
     error = correct_scalar(found.sensor, twice).field - twice.reference
-    assert np.sqrt(np.mean(error**2)) < 1.0
+    assert rms(error) < 1.0
 
 
 @pytest.mark.parametrize("rows", [[0], [800], [-1], [100, 101, 900]])
 def test_a_missing_value_costs_its_own_row(rows: list[int]) -> None:
-    series = _part(half(flown(8), False), slice(1200))
+    series = flown(8, slice(1200))
     vector, reference = series.vector.copy(), series.reference.copy()
     vector[rows, 1], reference[[300, 600]] = np.nan, np.nan
     missing = series._replace(vector=vector, reference=reference)
@@ -303,13 +258,12 @@ def test_a_missing_value_costs_its_own_row(rows: list[int]) -> None:
     assert np.nanmax(np.abs(design[:, 18])) < 40.0
 
 
-def test_the_file_holds_the_sensor_and_refuses_numbers_that_do_not_belong_together() -> None:
-    found = fit_scalar(half(flown(4), False), CHANNELS, column=SCALAR, map_known=True)
-    both = replace(identity(), sensors=(found.sensor,))
+def test_the_file_holds_the_sensor_and_refuses_numbers_that_do_not_belong_together(fitted: ScalarFit) -> None:
+    both = replace(identity(), sensors=(fitted.sensor,))
     written = encode_calibration(both)
     assert decode_calibration(written).sensors == both.sensors
     assert b'"format": 5' in written
-    sensor = msgspec.structs.replace(found.sensor, coefficients=found.sensor.coefficients[:-1])
+    sensor = msgspec.structs.replace(fitted.sensor, coefficients=fitted.sensor.coefficients[:-1])
     short = replace(both, sensors=(sensor,))
     with pytest.raises(CalibrationError, match=r"sensor 'mag_cabin': expected \d+ coefficients"):
         decode_calibration(encode_calibration(short))
@@ -329,16 +283,16 @@ def write(series: ScalarSeries, path: Path) -> None:
 
 def test_commands_calibrate_and_correct_a_scalar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series = flown(5)
-    write(half(series, False), tmp_path / "a.nc")
-    write(half(series, True), tmp_path / "b.nc")
+    write(part(series, FIRST), tmp_path / "a.nc")
+    write(part(series, SECOND), tmp_path / "b.nc")
     cal, out = tmp_path / "cal.json", tmp_path / "out.nc"
     assert main(["calibrate", str(tmp_path / "a.nc"), "--scalar", SCALAR, "-o", str(cal)]) == 0
     assert "with 3 channels" in capsys.readouterr().out
     assert [channel.name for channel in load(cal).sensors[0].channels] == list(CHANNELS)
     assert main(["correct", str(tmp_path / "b.nc"), "--calibration", str(cal), "-o", str(out)]) == 0
     back = logs.read(out)
-    error = back["scalar_field"].to_numpy() - half(series, True).reference
-    assert np.sqrt(np.mean(error**2)) < 2.0
+    error = back["scalar_field"].to_numpy() - part(series, SECOND).reference
+    assert rms(error) < 2.0
     assert np.mean((back["scalar_quality"].to_numpy().astype(int) & ScalarQuality.DISAGREES) > 0) < 0.01
     assert main(["calibrate", str(tmp_path / "a.nc"), "--lag", "1", "-o", str(cal)]) == 2
     assert "--scalar COLUMN" in capsys.readouterr().err
@@ -349,14 +303,14 @@ def test_commands_calibrate_and_correct_a_scalar(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.parametrize("dead", [0.0, 54_000.0])
 def test_a_dead_zone_is_flagged_and_not_fitted(tmp_path: Path, dead: float) -> None:
-    series = half(flown(7), False)
+    series = flown(7, FIRST)
     frozen = np.zeros(len(series.time), bool)
     frozen[600:700] = frozen[1500:1900] = True
     write(series._replace(scalar=np.where(frozen, dead, series.scalar)), tmp_path / "a.nc")
     log = mb.read(tmp_path / "a.nc")
     corrected = mb.correct(mb.calibrate(log, scalar=SCALAR), log)
     error = corrected["scalar_field"].to_numpy() - series.reference
-    assert np.sqrt(np.mean(error[~frozen] ** 2)) < 1.0
+    assert rms(error[~frozen]) < 1.0
     missing = (corrected["scalar_quality"].to_numpy().astype(int) & ScalarQuality.MISSING) > 0
     np.testing.assert_array_equal(missing, frozen)
 
@@ -372,7 +326,7 @@ def test_a_coarse_sensor_at_rest_may_repeat_its_reading() -> None:
 def test_a_compensation_that_improves_nothing_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    series = _part(half(flown(7), False), slice(1500))
+    series = flown(7, slice(1500))
     random = np.random.default_rng(2)
     write(series._replace(scalar=series.scalar + random.normal(0.0, 3_000.0, 1500)), tmp_path / "a.nc")
     cal = tmp_path / "cal.json"
@@ -385,18 +339,19 @@ def test_a_compensation_that_improves_nothing_is_not_written(
 
 
 def test_a_wrong_reference_is_refused_and_a_scalar_far_from_it_is_flagged(halves: Halves) -> None:
-    series, _, truth = halves
-    wrong = _part(series._replace(reference=0.5 * series.reference), slice(800))
-    found = fit_scalar(wrong, NAMES, map_known=True, lag=0.0)
+    series, _ = halves
+    wrong = part(series._replace(reference=0.5 * series.reference), slice(800))
+    found = fit_scalar(wrong, CHANNELS, map_known=True, lag=0.0)
     assert "sign of the latitude" in found.doubt
     n, one = 50, np.ones(50)
-    seen = compare_sensors(truth[:n] * 0.5, one, truth[:n] * 0.5, one, truth[:n])
+    truth = series.reference[:n]
+    seen = compare_sensors(truth * 0.5, one, truth * 0.5, one, truth)
     assert seen.disagrees.all()
-    assert (np.sqrt(seen.scalar_variance) > 0.4 * truth[:n]).all()
+    assert (np.sqrt(seen.scalar_variance) > 0.4 * truth).all()
 
 
 def test_a_doubtful_vector_makes_the_scalar_doubtful(tmp_path: Path) -> None:
-    series = half(flown(7), False)
+    series = flown(7, FIRST)
     write(series, tmp_path / "a.nc")
     log = mb.read(tmp_path / "a.nc")
     calibration = mb.calibrate(log, scalar=SCALAR)
@@ -416,7 +371,7 @@ def test_a_doubtful_vector_makes_the_scalar_doubtful(tmp_path: Path) -> None:
 
 
 def test_the_common_sigma_is_the_part_that_all_samples_share() -> None:
-    series = _part(half(flown(8), False), slice(1200))
+    series = flown(8, slice(1200))
     sensor = fit_scalar(series, CHANNELS, map_known=True, lag=0.0).sensor
     size = len(sensor.coefficients) - 1
     random = np.random.default_rng(1)
@@ -478,12 +433,11 @@ def test_a_lag_below_a_smooth_crustal_field_is_not_left_to_the_linear_term() -> 
     assert abs(found.sensor.lag - 0.12) < min(2.0 * found.lag_sigma, 0.01)
 
 
-def test_compiled_c_gives_the_field_of_python(tmp_path: Path) -> None:
+def test_compiled_c_gives_the_field_of_python(tmp_path: Path, halves: Halves, fitted: ScalarFit) -> None:
     gcc = shutil.which("gcc") or shutil.which("cc")
     if gcc is None:
         pytest.skip("no C compiler is installed")
-    series = half(flown(4), False)
-    sensor = fit_scalar(series, CHANNELS, column=SCALAR, map_known=True).sensor
+    series, sensor = halves[1], fitted.sensor
     save(replace(identity(), sensors=(sensor,)), tmp_path / "cal.json")
     assert main(["export", str(tmp_path / "cal.json"), "--c", str(tmp_path)]) == 0
     strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-shared", "-fPIC"]
@@ -526,4 +480,4 @@ def test_the_vector_is_calibrated_by_the_scalar(tmp_path: Path) -> None:
     assert load(cal).sensors == ()
     assert main(["correct", str(path), "--calibration", str(cal), "-o", str(out)]) == 0
     error = logs.read(out)["total_field"].to_numpy() - series.reference
-    assert np.sqrt(np.mean(error**2)) < 1.5
+    assert rms(error) < 1.5

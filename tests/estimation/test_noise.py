@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from magbridge.arrays import FloatArray
 from magbridge.estimation.noise import (
     NoiseModel,
+    Whitening,
     effective_fraction,
     estimate_noise,
     fit_slow_and_white,
@@ -178,3 +179,8 @@ def test_whitening_decorrelates_as_the_inverse_of_the_covariance_does(rho: float
     values = np.random.default_rng(2).normal(size=(len(steps), 3))
     found = whiten(values, steps, rho, white)
     np.testing.assert_allclose(found.T @ found, values.T @ np.linalg.solve(covariance, values), rtol=1e-9)
+    whitening = Whitening(steps, rho, white)
+    np.testing.assert_allclose(
+        np.vstack([whitening.apply(part) for part in np.array_split(values, 3)]), found
+    )
+    assert np.log(whitening.variance).sum() == pytest.approx(np.linalg.slogdet(covariance)[1])
