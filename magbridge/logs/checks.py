@@ -13,7 +13,6 @@ invalid rows. Programs without NaN write codes such as -999 for "not known".
 
 from __future__ import annotations
 
-import re
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,7 +29,7 @@ from magbridge.columns import CHANNEL_TIMES, CHANNELS, usual
 from magbridge.datasets import YEAR_10000, disorder, disordered, expected_time
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
-from magbridge.logs.mapping import bare
+from magbridge.logs.mapping import PATTERNS, bare, is_called
 from magbridge.records import NULL_POSITION_DEG
 
 Piece = tuple[xr.Dataset, Sequence[int]]
@@ -304,10 +303,6 @@ def boots(time: FloatArray) -> IndexArray:
     return np.array(found, dtype=np.intp)
 
 
-VALID = re.compile("(is|data|row|sample)?valid(ity)?")
-MAG_VALID = re.compile("(mag|field|tmi)(is)?valid(ity)?")
-QUALITY_OF = re.compile(r"(.+?)[ _.]?(QC|qc|quality_flag)")
-FLAG = re.compile("(mag|qc|quality|data)?flag")
 BAD_QUALITY = frozenset({3.0, 4.0, 9.0})
 MAX_FLAGGED = 0.2
 """Largest fraction of rows that a column Flag may mark."""
@@ -332,9 +327,8 @@ class Validity(NamedTuple):
 
 def states_validity(name: str) -> bool:
     """Return True if a column of this name states the validity of other columns."""
-    word = bare(name)
-    named = any(pattern.fullmatch(word) for pattern in (VALID, MAG_VALID, FLAG))
-    return named or bool(QUALITY_OF.fullmatch(name))
+    named = any(is_called(name, kind) for kind in ("valid", "valid field", "flag"))
+    return named or bool(PATTERNS["quality"].fullmatch(name))
 
 
 def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Validity]:
@@ -342,15 +336,14 @@ def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Val
     found = []
     words = [bare(name) if name else None for name in names]
     for k, name in enumerate(names):
-        word = bare(name)
-        if VALID.fullmatch(word):
+        if is_called(name, "valid"):
             found.append(Validity(name, (), frozenset({0.0})))
-        elif MAG_VALID.fullmatch(word):
+        elif is_called(name, "valid field"):
             targets = ("total_field",) if "total_field" in names else CHANNELS
             found.append(Validity(name, targets, frozenset({0.0})))
-        elif (match := QUALITY_OF.fullmatch(name)) and bare(match[1]) in words:
+        elif (match := PATTERNS["quality"].fullmatch(name)) and bare(match[1]) in words:
             found.append(Validity(name, (names[words.index(bare(match[1]))],), BAD_QUALITY))
-        elif FLAG.fullmatch(word):
+        elif is_called(name, "flag"):
             marks = [row[k].removesuffix(".0") for row in rows if k < len(row) and row[k]]
             rare = min("10", key=marks.count)
             if marks and {*marks} <= {*"01"} and marks.count(rare) <= MAX_FLAGGED * len(marks):

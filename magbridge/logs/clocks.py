@@ -141,8 +141,6 @@ class CountState(NamedTuple):
     """Shift that is added to the times for wraps, such as midnights, and for earlier runs, s."""
     last: FloatArray = np.empty(0)
     """(n,): Last times before the shift, s."""
-    end_s: float = 0.0
-    """Last time before the latest wrap or restart, with the shift, s."""
 
     def go_on(self, times: FloatArray, clock: TimeFormat) -> tuple[FloatArray, CountState, int]:
         """Return the next times (n,), s, with the shift, the new state, and the number of boots.
@@ -155,7 +153,7 @@ class CountState(NamedTuple):
         before = len(self.last)
         whole = np.concatenate([self.last, times])
         known = np.flatnonzero(np.isfinite(whole))
-        shift, end, boots_found = self.shift_s, self.end_s, 0
+        shift, boots_found = self.shift_s, 0
         shifts = np.full(len(times), shift)
         for k in boots(whole[known])[1:].tolist():
             row, last = int(known[k]), float(whole[known[k - 1]])
@@ -165,12 +163,11 @@ class CountState(NamedTuple):
             is_restart = not clock.is_text and len(known) - k >= MIN_RUN_ROWS
             if row < seen or not (has_wrapped or is_restart):
                 continue
-            end = shift + last
-            shift = shift + period if has_wrapped else end + BETWEEN_RUNS_S - whole[row]
+            shift += period if has_wrapped else last + BETWEEN_RUNS_S - whole[row]
             boots_found += not has_wrapped
             shifts[max(row - before, 0) :] = shift
         last_times = whole[known[-MEDIAN_ROWS:]] if len(known) else self.last
-        return times + shifts, CountState(shift, last_times, end), boots_found
+        return times + shifts, CountState(shift, last_times), boots_found
 
 
 def date_order(headings: Sequence[str]) -> str:

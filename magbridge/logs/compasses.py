@@ -25,14 +25,13 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.checks import in_order
-from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
+from magbridge.logs.clocks import BETWEEN_RUNS_S
+from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, shifted, sliced, uncounted
 from magbridge.logs.fields import latest
 from magbridge.wording import counted
 
 Series = tuple[FloatArray, str, str, FloatArray]
 """Times (m,), s, name and unit of a column, and its values (m,)."""
-MIN_BOOT_INTERVAL_S = 60.0
-"""Interval set between two boots whose times would overlap, s, so that no value is carried across."""
 OTHER = re.compile(r"mag[1-9]\d*_x$")
 """Name of the x axis of a numbered compass, as ``mag2_x``."""
 AXIS = re.compile(r"mag([1-9]\d*)?_[xyz]$")
@@ -261,8 +260,8 @@ def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
         time = run["time"].values
         kept = time[in_order(time)]
         if len(kept) and kept[0] <= ended:
-            later = ended + MIN_BOOT_INTERVAL_S - float(kept[0])
-            runs[k] = run.assign_coords(time=run["time"].copy(data=time + later))
+            later = ended + BETWEEN_RUNS_S - float(kept[0])
+            runs[k] = shifted(run, later)
             why = "begins by its own clock before the end of the last"
             notes.append(f"boot {k + 1} {why}: moved by {later:.0f} s")
         if len(kept):

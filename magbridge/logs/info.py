@@ -9,14 +9,14 @@ import xarray as xr
 from msgspec import to_builtins
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot, usual
+from magbridge.columns import AGE, CHANNELS, COLUMNS, counts_from_boot, usual
 from magbridge.datasets import in_standard_units
 from magbridge.field.igrf import magnitude
 from magbridge.logs.checks import states_validity
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
-from magbridge.logs.mapping import bare
-from magbridge.logs.naming import HEIGHT_NAME, READING_RANGE_NT
+from magbridge.logs.mapping import is_called
+from magbridge.logs.naming import earthly_units
 
 HORIZONTAL_POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
@@ -172,23 +172,18 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     if set(CHANNELS) <= set(log.data_vars):
         lengths = magnitude(log[list(CHANNELS)].to_array().to_numpy().T)
         length = float(np.median(lengths)) if len(lengths := lengths[np.isfinite(lengths)]) else 0.0
-        if length and not READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
-            fitting = [
-                unit
-                for unit, factor in NT_PER_UNIT.items()
-                if READING_RANGE_NT[0] < length * factor < READING_RANGE_NT[1]
-            ]
-            lines = [
-                f'; in {unit} it would be the Earth\'s: --column mag_x="THEIRS [{unit}]" and so on'
-                for unit in fitting[:1]
-            ]
-            hints.append(f"the vector's length is {length:.4g} nT (median){''.join(lines)}")
+        if length and "nT" not in (fitting := earthly_units(length)):
+            hint = f"the vector's length is {length:.4g} nT (median)"
+            if fitting:
+                declared = f'--column mag_x="THEIRS [{fitting[0]}]" and so on'
+                hint += f"; in {fitting[0]} it would be the Earth's: {declared}"
+            hints.append(hint)
     if counts_from_boot(log):
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
     depth = log["depth"].dropna("time").to_numpy() if "depth" in log else np.empty(0)
-    heights = [one["name"] for one in columns if HEIGHT_NAME.fullmatch(bare(one["name"]))]
+    heights = [one["name"] for one in columns if is_called(one["name"], "height")]
     if "depth" not in log and heights:
         hints.append(f'{heights[0]} is not used: as height above the sea, --column depth="{heights[0]}"')
     is_height = "depth is minus" in str(log.attrs.get("guessed", ""))

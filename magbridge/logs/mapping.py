@@ -31,6 +31,7 @@ CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
 NAMES = load_toml(Path(__file__).with_name("names.toml"))
 """Names of columns and units in other programs."""
+PATTERNS = {name: re.compile(pattern) for name, pattern in NAMES["patterns"].items()}
 KNOWN_UNITS = {*NT_PER_UNIT, *(column.units for column in COLUMNS.values()), *NAMES["units"].split()} - {"1"}
 """Units by which a row of units under the headings is recognised."""
 
@@ -171,6 +172,11 @@ def split(heading: str) -> tuple[str, str]:
 def bare(name: str) -> str:
     """Return a name in lower case, without punctuation."""
     return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def is_called(name: str, kind: str) -> bool:
+    """Return True if a name, in lower case without punctuation, matches a pattern of ``names.toml``."""
+    return PATTERNS[kind].fullmatch(bare(name)) is not None
 
 
 def is_unit(text: str) -> bool:

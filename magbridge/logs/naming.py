@@ -16,14 +16,10 @@ from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usua
 from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
-from magbridge.logs.mapping import CELL_NUMBER, NAMES, ColumnSource, bare, is_unit, split
+from magbridge.logs.mapping import CELL_NUMBER, NAMES, PATTERNS, ColumnSource, bare, is_called, is_unit, split
 
 AXES = "xyz"
 PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
-VECTORS = NAMES["vectors"].split()
-"""Patterns of the three axes' names in other programs, in lower case without punctuation."""
-ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
-"""Name of an axis after the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
 ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
 """Standard name -> names in other programs, the least ambiguous first."""
 TOWED = NAMES["towed"].split()
@@ -32,8 +28,6 @@ PREFIXED_NAME = re.compile(
     rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
 )
 """Name of a position or an angle, with the words that may stand before and after it."""
-LAST_LETTER = re.compile(r"(.*)([xyz])")
-"""Name of an axis in a column with a unit of magnetic fields."""
 MAX_SENSORS = 8
 """Largest number of a further vector sensor in one file."""
 NUMBERINGS = (r"0(\D*)$", r"{0}\1"), (r"1(\D*)$", r"{1}\1"), (r"(.)$", r"{1}\1"), (r"$", r"{1}")
@@ -44,33 +38,14 @@ ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 HOUR = re.compile(
     r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
 )
-DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyy.?mm.?dd|dd.?mm.?yy|mm.?dd.?yy)", re.IGNORECASE)
-"""Part of a heading that marks a column of dates."""
-TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
-"""Part of a heading that marks the column of times, if only one heading has it."""
-UTM_HEADING = re.compile(r"([xy])_\w*?utm_?(\d{1,2})([ns])_m", re.IGNORECASE)
-"""Heading of an easting or northing that names a zone of UTM, as MagComPy's ``X_NAD83UTM10N_m``."""
-LINE_NAMES = "line", "linename", "lineno", "linenumber"
-"""Names of the column with the survey line, in lower case without punctuation."""
-HEIGHT_NAME = re.compile(
-    "(gps|gnss|msl|ellipsoid(al)?|baro|barometric)?(alt|altitude|height|hohe)"
-    "(msl|amsl|asl|gps|ellipsoid(al)?|wgs84)?(m|ft|feet)?"
-)
-"""Name of a column with the height above the sea, in lower case without punctuation."""
 HEIGHT_UNITS = {"m": 1.0, "ft": 0.3048, "feet": 0.3048, "km": 1e3}
 """Unit of a height -> its size, m."""
-REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
-"""Words in brackets after a heading that are not units."""
 DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
 """A cell that is a date with its time of day."""
 CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
 """A cell that is a time of day."""
 HOUR_AND_MINUTE = re.compile(r"([01]?\d|2[0-3])?[0-5]?\d(\.\d+)?")
 """A cell that is a time of day as HHMM.mmm, as in the exchange format MGD77T."""
-SECONDS_HEADING = re.compile("day|sod|utc|midnight", re.IGNORECASE)
-"""Part of a heading that marks seconds since midnight, in a file with a column of dates."""
-JOINED: dict[str, list[str]] = NAMES["times"]
-"""Kind of time that several columns form -> patterns of their names, in lower case without punctuation."""
 UNIT_CELL_COLUMNS = "depth", "total_field", "sensor_temperature"
 """Standard columns whose cells may end with a unit, as 5.8m; those of a position end with N, S, E or W."""
 WITH_UNIT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+) ?([a-zA-Z°µ%/]+)")
@@ -92,7 +67,7 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     layout = _with_names(path, layout, [name for name, _ in parts], declares)
     for k, name in enumerate(layout.names):
         layout = _with_unit(layout, name, layout.headings[k], declares[k])
-    lines = [k for k, name in enumerate(layout.names) if bare(name) in LINE_NAMES]
+    lines = [k for k, name in enumerate(layout.names) if is_called(name, "line")]
     if layout.foreign and len(lines) == 1:
         layout = layout.renamed({lines[0]: "line"})
     layout = _with_height(_with_utm(layout))
@@ -121,7 +96,7 @@ def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[st
     open_to_all = ["" if k in taken or name.startswith("truth_") else name for k, name in enumerate(names)]
     known = {k: name for k, name in aliases(open_to_all, units).items() if name not in taken.values()}
     if "time" not in {*taken.values(), *known.values(), *names}:
-        timed = [k for k, name in enumerate(names) if TIMED.search(name) and k not in taken]
+        timed = [k for k, name in enumerate(names) if PATTERNS["time"].search(name) and k not in taken]
         known |= dict.fromkeys(timed[:1], "time") if len(timed) == 1 else {}
     layout = layout.guessing(*(f"{name} is {headings[k]!r}" for k, name in known.items()))
     if nameless := [str(k + 1) for k, heading in enumerate(headings) if not heading and k not in taken]:
@@ -145,7 +120,7 @@ def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
     if name == "heading" and (match := re.search(r"\b(magnetic|mag)\b", f"{heading} {unit}".lower())):
         layout = replace(layout, attrs={"heading_reference": "magnetic", **layout.attrs})
         unit = unit.replace(match[1], "").strip(" ,")
-    if name in COLUMNS and unit.lower() in REMARKS:
+    if name in COLUMNS and unit.lower() in NAMES["remarks"].split():
         unit = ""
     if source := layout.declared.columns.get(name):
         theirs = (source.heading or heading).strip()
@@ -183,7 +158,7 @@ def _with_utm(layout: Layout) -> Layout:
     """
     names, zones = {}, set()
     for k, heading in enumerate(layout.headings):
-        if match := UTM_HEADING.fullmatch(heading.strip()):
+        if match := PATTERNS["UTM"].fullmatch(heading.strip()):
             names[k] = "longitude" if match[1] in "xX" else "latitude"
             zones.add(f"{PROJECTED_UNIT}{'326' if match[3] in 'nN' else '327'}{int(match[2]):02d}")
     if sorted(names.values()) != [*HEMISPHERES] or len(zones) != 1 or {*HEMISPHERES} & {*layout.names}:
@@ -196,11 +171,11 @@ def _with_height(layout: Layout) -> Layout:
     """Return the layout with the opposite of a height as ``depth``, if a log with positions has no depth."""
     declared = layout.declared.columns.get("depth", ColumnSource())
     if "depth" not in layout.names:
-        heights = [k for k, name in enumerate(layout.names) if HEIGHT_NAME.fullmatch(bare(name))]
+        heights = [k for k, name in enumerate(layout.names) if is_called(name, "height")]
         if not (layout.foreign and heights and "latitude" in layout.names):
             return layout
         k = heights[0]
-    elif HEIGHT_NAME.fullmatch(bare(split(declared.heading or "")[0])) and declared.scale == 1.0:
+    elif is_called(split(declared.heading or "")[0], "height") and declared.scale == 1.0:
         k = layout.names.index("depth")
     else:
         return layout
@@ -237,11 +212,11 @@ def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str]:
     unit = layout.units.get("time", "")
     ours = [name if name in layout.declared.columns else "" for name in layout.names]
     called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, layout.headings, strict=True)]
-    for kind, patterns in JOINED.items():
+    for kind, patterns in NAMES["times"].items():
         places = [[k for k, name in enumerate(called) if re.fullmatch(one, name)] for one in patterns]
         if all(len(one) == 1 for one in places) and (place is None or [place] in places):
             return tuple(k for (k,) in places), kind if len(patterns) == 2 else ""
-    dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
+    dates = [k for k, name in enumerate(called) if PATTERNS["date"].search(name) and k != place]
     if place is None and len(dates) == 1:
         clocks = [k for k in range(len(called)) if k not in dates and _all_match(CLOCK, rows, k)]
         near = [k for k in clocks if called[k][:4] == called[dates[0]][:4]]
@@ -253,7 +228,10 @@ def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str]:
     # the time is a time of day, unless its cells are whole moments or count something else
     present = cells_in(rows, place)
     numbers = pd.to_numeric(pd.Series(present, dtype="str").str.replace(",", "."), errors="coerce")
-    counted = SECONDS_HEADING.search(layout.headings[place]) and numbers.between(0.0, DAY, "left").all()
+    counted = (
+        PATTERNS["seconds since midnight"].search(layout.headings[place])
+        and numbers.between(0.0, DAY, "left").all()
+    )
     undated = "%" in unit and not {"%d", "%j"} & {*re.findall("%.", unit)}
     by_hour = not unit and not counted and _by_hour(present)
     on_clock = [HOUR.fullmatch(cell) is not None for cell in present]
@@ -283,7 +261,7 @@ def calendar_of(layout: Layout, rows: Rows) -> tuple[int, ...]:
     """Return the indices of fields, other than the time, that alone give date and time of day."""
     others = [k for k in range(len(layout.headings)) if k not in layout.stamp]
     moments = [k for k in others if _all_match(DATE_AND_TIME, rows, k)]
-    dates = [k for k in others if DATED.search(layout.headings[k])]
+    dates = [k for k in others if PATTERNS["date"].search(layout.headings[k])]
     clocks = [k for k in others if _all_match(CLOCK, rows, k)]
     if len(moments) == 1:
         return tuple(moments)
@@ -317,18 +295,17 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
     return layout.guessing(f"left out, no numbers: {', '.join(texts)}") if texts else layout
 
 
-READING_RANGE_NT = LOWEST_NT, HIGHEST_NT = 15_000.0, 90_000.0
+READING_RANGE_NT = 15_000.0, 90_000.0
 """Range of a reading's magnitude, the Earth's field plus the vehicle's, nT."""
-SCALAR_NAME = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
-"""Names of a scalar sensor in a file with a vector, in lower case without punctuation."""
-TOTAL_NAME = re.compile(
-    f"{SCALAR_NAME.pattern}|f|nt|mag|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?field|magneticfield"
-    "|reading1|magnitude"
-)
-"""Names of a scalar sensor, also those that may be a vector's magnitude."""
 ANGLES = "roll", "pitch", "heading"
 NEAR_HALF_TURN_RAD = 0.1
 """Headings whose maximum is less than this below pi or 2 pi are taken as radians, rad."""
+
+
+def earthly_units(length: float) -> list[str]:
+    """Return the units in which a vector of this length is in :data:`READING_RANGE_NT`."""
+    low, high = READING_RANGE_NT
+    return [unit for unit, factor in NT_PER_UNIT.items() if low < length * factor < high]
 
 
 def units_of_angles(layout: Layout, rows: Rows) -> Layout:
@@ -356,8 +333,7 @@ def _with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
     stated = {layout.units.get(name, "") for name in CHANNELS}
     if stated == {""}:
         length = _length(layout, rows, [layout.names.index(name) for name in CHANNELS])
-        units = {unit: length * factor for unit, factor in NT_PER_UNIT.items()}
-        fitting = [unit for unit, nanotesla in units.items() if LOWEST_NT < nanotesla < HIGHEST_NT]
+        fitting = earthly_units(length)
         unit = "" if "nT" in fitting else next(iter(fitting), "")
         guess = f"mag_x, mag_y, mag_z in {unit}, by the field's length"
     elif len(stated) == 2 and "" in stated:
@@ -375,15 +351,15 @@ def _with_total(layout: Layout, rows: Rows) -> Layout:
     """Return the layout with ``total_field``, if one column has a scalar's name and the Earth's magnitude."""
     if not layout.foreign or "total_field" in layout.names:
         return layout
-    pattern = SCALAR_NAME if set(CHANNELS) <= set(layout.names) else TOTAL_NAME
+    kinds = ["scalar"] if set(CHANNELS) <= set(layout.names) else ["scalar", "total field"]
     others = {k: name for k, name in enumerate(layout.names) if name not in COLUMNS}
-    fields = [k for k, name in others.items() if pattern.fullmatch(bare(name))]
+    fields = [k for k, name in others.items() if any(is_called(name, kind) for kind in kinds)]
     if len(fields) != 1:
         return layout
     theirs = layout.names[fields[0]]
     unit = layout.units.get(theirs, "nT")
     length = _length(layout, rows, fields) * NT_PER_UNIT.get(usual(unit), 0.0)
-    if not LOWEST_NT < length < HIGHEST_NT:
+    if "nT" not in earthly_units(length):
         return layout
     units = {name: unit for name, unit in layout.units.items() if name != theirs}
     layout = replace(layout, units={**units, "total_field": unit}).renamed({fields[0]: "total_field"})
@@ -417,7 +393,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
         return words.index(word) if words.count(word) == 1 else None
 
     if not set(CHANNELS) <= set(names):
-        for pattern in VECTORS:
+        for pattern in NAMES["vectors"].split():
             places = [only(pattern.format(axis)) for axis in AXES]
             if None not in places:
                 found |= {int(k or 0): name for k, name in zip(places, CHANNELS, strict=True)}
@@ -426,8 +402,8 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
             fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and words[k]]
             of_fields = [word if k in fields else "" for k, word in enumerate(words)]
             others = ["" if name in COLUMNS else word for name, word in zip(names, words, strict=True)]
-            found |= _vector(of_fields, LAST_LETTER) if len(fields) == len(AXES) else {}
-            found |= {} if found else _vector(others, ENDING)
+            found |= _vector(of_fields, PATTERNS["axis with a unit"]) if len(fields) == len(AXES) else {}
+            found |= {} if found else _vector(others, PATTERNS["axis"])
         found |= _further_axes(names, words, {name: k for k, name in found.items()})
     pair = _position(words)
     if any(names[k] != name for k, name in pair.items()):

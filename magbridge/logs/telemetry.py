@@ -30,7 +30,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
@@ -216,8 +215,6 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     if compasses:
         found = choose(path, compasses, wanted)
         log.source = next(one for one in found if one.chosen).id
-        span_s = log.span_s()
-        found = [replace(one, rate=(one.samples - 1) / span_s if span_s > 0 else 0.0) for one in found]
         attrs |= listed(found)
         notes = [*notes, *compass_notes(found, wanted)]
     if notes:
@@ -334,14 +331,11 @@ class TelemetryLog:
         """Return the compasses whose field the sender's messages hold, in the order of their numbers."""
         found = {}
         for message, number in COMPASS_NUMBERS.items():
-            if number not in found and (n := len(self._samples(message).at)):
-                found[number] = LogCompass(number, n, 0.0, message)
+            time_us = self._samples(message).time_us
+            if number not in found and (n := len(time_us)):
+                mean_rate = 1e6 * (n - 1) / max(int(time_us[-1] - time_us[0]), 1)
+                found[number] = LogCompass(number, n, mean_rate, message)
         return [found[number] for number in sorted(found)]
-
-    def span_s(self) -> float:
-        """Return the time from the first to the last message that makes a row, s."""
-        time_us = self._samples(self.source).time_us
-        return float(time_us[-1] - time_us[0]) / 1e6
 
     def _samples(self, message: str) -> LogMessages:
         """Return the messages of one kind from the component that sends the rows."""
@@ -355,7 +349,6 @@ class TelemetryLog:
         frequent sender. Gimbals come last.
         """
         units: dict[str, str] = {}
-        read = []
         for number, fields in MAVLINK_FIELDS.items():
             messages = _messages_of(self._kinds, number)
             ranks = [
@@ -366,13 +359,15 @@ class TelemetryLog:
                 continue
             messages = messages.chosen(messages.component == max(ranks)[-1])
             for column, unit, values in messages.columns(fields):
-                read.append((column, messages, values))
                 if not np.isnan(values).all():
                     units.setdefault(column, unit)
-        for column, messages, values in read:
-            if column in units and column not in declared:
-                self._updates.setdefault(column, []).append((messages, values))
+                    if column not in declared:
+                        self._add(column, messages, values)
         return units
+
+    def _add(self, column: str, messages: LogMessages, values: FloatArray) -> None:
+        """Add messages with the values (n,) of a column to the sources of this column."""
+        self._updates.setdefault(column, []).append((messages, values))
 
     def _columns_of_bridge(self) -> dict[str, str]:
         """Return the units of the columns that have a value in a bridge's ``MAG_RAW`` or ``MAG_FIELD``."""
@@ -406,7 +401,7 @@ class TelemetryLog:
         source = Source(AUTOPILOT, round(1e6 * max_age_s), component)
         senders = zip(messages.component.tolist(), messages.time_us.tolist(), strict=True)
         admitted = np.array([source.admit(one, time_us) for one, time_us in senders], bool)
-        self._updates.setdefault(column, []).append((messages.chosen(admitted), values[admitted]))
+        self._add(column, messages.chosen(admitted), values[admitted])
 
     def _add_named(self, declared: set[str]) -> None:
         """Add a column for each name of a ``NAMED_VALUE_FLOAT``, except the names in `declared`."""
@@ -429,7 +424,7 @@ class TelemetryLog:
                 continue
             counts = [(one == AUTOPILOT, n, one) for (_, one), n in messages.senders().items()]
             here = messages.component == max(counts)[-1]
-            self._updates.setdefault(own, []).append((messages.chosen(here), values[here]))
+            self._add(own, messages.chosen(here), values[here])
 
     def table(self) -> tuple[FloatArray, dict[str, FloatArray], dict[str, str]]:
         """Return the times (n,), s since 1970 UTC, the columns (n,) by name, and their units."""
@@ -443,7 +438,7 @@ class TelemetryLog:
             values = one.values(messages)
             if one.source.column.endswith(OTHER_TIME):
                 values = values + self._to_step_us(messages.at) / 1e6
-            self._updates.setdefault(one.source.column, []).append((messages, values))
+            self._add(one.source.column, messages, values)
         raw = {one.column for one in MAVLINK_FIELDS.get(rows.number, []) if one.column.startswith("mag")}
         own = [f"mag_{axis}" for axis in "xyz" if "IMU" in self.source]
         columns = {name: np.full(len(rows.at), np.nan) for name in (*own, *self._units) if name not in raw}
