@@ -26,7 +26,6 @@ from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.geodesy import metres_per_degree, signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.spline import filled
-from magbridge.files import atomic_path
 
 __all__ = [
     "continued", "draw_steps", "merge", "prepare", "raised", "smoothed", "surveyed_at",
@@ -334,6 +333,8 @@ def draw_steps(steps: Sequence[PreparationStep], path: str | Path) -> None:
     """Draw the grids of all steps with one colour scale, and write the page to `path` (PNG, PDF, SVG)."""
     from matplotlib.figure import Figure  # noqa: PLC0415  only drawing needs it
 
+    from magbridge.pictures import save  # noqa: PLC0415
+
     columns = min(3, len(steps))
     rows = -(-len(steps) // columns)
     figure = Figure(figsize=(5.2 * columns, 4.4 * rows), layout="constrained")
@@ -356,8 +357,7 @@ def draw_steps(steps: Sequence[PreparationStep], path: str | Path) -> None:
     figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)
     figure.supxlabel("longitude, deg", fontsize="medium")
     figure.supylabel("latitude, deg", fontsize="medium")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save(figure, path)
 
 
 def _masked(grid: AnomalyGrid, polygon: FloatArray) -> AnomalyGrid:
