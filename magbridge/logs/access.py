@@ -7,12 +7,13 @@ Attributes of the deployment count and name both losses.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from itertools import accumulate, chain, pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,13 +25,11 @@ from magbridge.datasets import in_standard_units, increasing
 from magbridge.errors import AbsentColumns, DataError, FormatError, WriteError, WrongUse
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
-from magbridge.logs.checks import checked
+from magbridge.logs.checks import Piece, checked
 from magbridge.logs.compasses import by_columns
 from magbridge.logs.deployment import (
     FROM_BOOT,
-    NOTES,
     join,
-    noted,
     passed_over,
     refuse_repeated,
     renamed,
@@ -38,6 +37,7 @@ from magbridge.logs.deployment import (
     shifted,
     uncounted,
     with_losses,
+    with_notes,
 )  # fmt: skip
 from magbridge.logs.mapping import Options
 from magbridge.logs.merge import combine, merge, refuse_offset
@@ -56,6 +56,8 @@ ALL_ROWS = 1 << 40
 """Number of rows that is larger than any file has."""
 MAX_SHARED_BYTES = 4_000_000
 """Size of files below which one child process reads several of them, bytes."""
+WRITTEN_FROM = re.compile(r"[^(,]* \(((?:[^()]|\([^()]*\))*)\)")
+"""Source of a file with the source that it was written from in brackets: ``b.nc (a.csv)``."""
 DEFAULTS = Options()
 
 
@@ -173,7 +175,7 @@ class _Files:
         """Errors of the unreadable files."""
         self._lacking: dict[Path, set[str]] = {}
         self._reported = 0
-        self._together: dict[int, Iterator[Any]] | None = None
+        self._together: dict[int, Iterator[Piece]] | None = None
 
     def pieces(self, k: int, rows: int) -> Iterator[xr.Dataset]:
         """Yield the readable pieces of file `k`; FormatError: no file is readable, or options are strict.
@@ -235,7 +237,7 @@ def without_companions(paths: Sequence[Path]) -> list[Path]:
     return [path for path in paths if not is_companion(path)]
 
 
-def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:
+def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Piece]]:
     """Read the small files that need a child process in one child; return their pieces by index."""
     small = [
         k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < MAX_SHARED_BYTES
@@ -250,19 +252,25 @@ def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[i
     return {k: child.pieces(number) for number, k in enumerate(formats)}
 
 
-def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]:
-    """Yield the pieces that the format's module reads; PluginError: another package's module fails."""
+def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Piece]:
+    """Yield the pieces that the format's module reads, each with its row numbers, by default from 1 on.
+
+    PluginError: another package's module fails.
+    """
     chunks = form.load().chunks
     more = (options,) if "options" in signature(chunks).parameters else ()
+    count = 0
     with form.blamed():
-        for piece in chunks(path, rows, *more):
-            if form.plugin and not hasattr(piece[0] if isinstance(piece, tuple) else piece, "sizes"):
-                raise TypeError(f"chunks: expected deployments (xarray.Dataset), not {type(piece).__name__}")
-            yield piece
+        for found in chunks(path, rows, *more):
+            piece, numbers = found if isinstance(found, tuple) else (found, None)
+            if form.plugin and not hasattr(piece, "sizes"):
+                raise TypeError(f"chunks: expected deployments (xarray.Dataset), not {type(found).__name__}")
+            first, count = count + 1, count + piece.sizes["time"]
+            yield piece, range(first, count + 1) if numbers is None else numbers
 
 
 def _chunks(
-    path: Path, rows: int, options: Options, contents: Iterator[Any] | None = None
+    path: Path, rows: int, options: Options, contents: Iterator[Piece] | None = None
 ) -> Iterator[xr.Dataset]:
     """Yield a file's pieces, checked and dated; `contents` are its pieces if a shared child reads them."""
     if not path.stat().st_size:
@@ -272,7 +280,7 @@ def _chunks(
     pieces = partial(_raw, path, form, rows, options)
     part = None
     try:
-        numbered = _numbered(contents or (guarded(path, pieces) if form.guarded else pieces()))
+        numbered = contents or (guarded(path, pieces) if form.guarded else pieces())
         if options.compass is not None and not form.compasses:
             numbered = ((by_columns(piece, options.compass), rows) for piece, rows in numbered)
         if options.declared.columns and not form.maps_columns:
@@ -282,7 +290,8 @@ def _chunks(
                 raise FormatError(path, f"expected a log without {' '.join(lost)}, as --strict was given")
             source = str(part.attrs["source"])
             if source != path.name:
-                source = f"{path.name} ({_origin(source)})"
+                origin = WRITTEN_FROM.fullmatch(source)
+                source = f"{path.name} ({origin[1] if origin else source})"
             yield _dated(part.assign_attrs(source=source), options.date)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
@@ -290,17 +299,6 @@ def _chunks(
         raise FormatError(path, f"expected a whole compressed file: {error}") from None
     if part is None:
         raise FormatError(path, "expected rows, there are none")
-
-
-def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield each piece with its row numbers, as the reader gives them or counted from 1."""
-    row = 1
-    for piece in pieces:
-        if isinstance(piece, tuple):
-            yield piece
-        else:
-            yield piece, range(row, row + piece.sizes["time"])
-            row += piece.sizes["time"]
 
 
 METRES_OF_WATER = {"dbar": 0.99, "bar": 9.9}
@@ -318,7 +316,7 @@ def _without_depth(dataset: xr.Dataset) -> xr.Dataset:
                 f"{dataset.attrs['source']}: no depth: taken as 0 m; if {name} is the water's: "
                 f"{remedy}scale = {METRES_OF_WATER[unit]:g}"
             )
-            return dataset.assign_attrs({NOTES: "\n".join([*noted(dataset.attrs), note])})
+            return with_notes(dataset, [note])
     return dataset
 
 
@@ -331,17 +329,8 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
         return part
     if not counts_from_boot(part):
         unused = f"{part.attrs['source']}: --date was not used, because the log's times have a date"
-        return part.assign_attrs({NOTES: "\n".join([*noted(part.attrs), unused])})
+        return with_notes(part, [unused])
     return shifted(part, date).assign_attrs({"time_reference": "utc", FROM_BOOT: 1})
-
-
-def _origin(source: str) -> str:
-    """Return the source in brackets, as ``a.csv`` of ``b.nc (a.csv)``; without brackets, `source` itself."""
-    name, opened, inside = source.partition(" (")
-    depths = list(accumulate((char == "(") - (char == ")") for char in inside))
-    # one pair of brackets encloses the rest; several sources have several pairs
-    is_whole = opened and "," not in name and min(depths, default=0) == -1 == depths[-1]
-    return inside[:-1] if is_whole and -1 not in depths[:-1] else source
 
 
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:

@@ -34,7 +34,6 @@ from magbridge.logs.checks import boots
 from magbridge.logs.clocks import GPS_EPOCH, WEEK, leap_seconds
 from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, sampled, symmetric
 from magbridge.logs.dataflash import OWN_SCALE, Flash, Records, read_binary, read_text
-from magbridge.logs.deployment import NOTES
 from magbridge.logs.fields import DEG_PER_RAD, FieldMap, field_maps, fields_of
 from magbridge.logs.mapping import Options
 
@@ -60,8 +59,8 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     if not runs:
         timeless = ", whose records have times" * any(name.startswith("MAG") for name in records)
         raise FormatError(path, f"expected an ArduPilot log with MAG records{timeless}")
-    attrs = {"lines_skipped" if text else "bytes_skipped": flash.skipped, NOTES: "\n".join(notes)}
-    yield from pieces(path, rows, runs, attrs, options.compass if options else None)
+    lost = {"lines_skipped" if text else "bytes_skipped": flash.skipped}
+    yield from pieces(path, rows, runs, lost, notes, options.compass if options else None)
 
 
 def _run(fields: Fields, records: dict[str, Records]) -> BootRun:

@@ -26,7 +26,7 @@ from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.checks import in_order
 from magbridge.logs.clocks import BETWEEN_RUNS_S
-from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, shifted, sliced, uncounted
+from magbridge.logs.deployment import deployment, same_columns, shifted, sliced, uncounted, with_notes
 from magbridge.logs.fields import latest
 from magbridge.wording import counted
 
@@ -205,30 +205,33 @@ def _by_names(log: xr.Dataset) -> list[LogCompass]:
 
 
 def pieces(
-    path: Path, rows: int, runs: Sequence[BootRun], attrs: Mapping[str, Any], compass: str | None = None
+    path: Path,
+    rows: int,
+    runs: Sequence[BootRun],
+    attrs: Mapping[str, Any],
+    notes: Sequence[str],
+    compass: str | None = None,
 ) -> Iterator[xr.Dataset]:
-    """Yield the log run by run in pieces of at most `rows` rows; the first has the counts in `attrs`.
+    """Yield the log run by run in pieces of at most `rows` rows; the first has `notes` and counts in `attrs`.
 
     If some runs have UTC, runs without UTC are left out, and their rows are counted as dropped.
     """
     dated = [run for run in runs if run.offset is not None]
     chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)
-    notes = [*noted(attrs), *compass_notes(chosen, compass)]
+    attrs = {**attrs, **listed(chosen), **({} if dated else {"time_reference": "boot"})}
+    notes = [*notes, *compass_notes(chosen, compass)]
     if len(runs) > 1:
         notes.append(f"{len(runs)} boots, each a run of its own")
-    counts = {name: value for name, value in attrs.items() if name != NOTES}
     if dated and len(dated) < len(runs):
         lost = sum(len(run.magnetometers[0].time) for run in runs if run.offset is None)
-        counts["rows_dropped"] = counts.get("rows_dropped", 0) + lost
+        attrs["rows_dropped"] = attrs.get("rows_dropped", 0) + lost
         notes.append(f"{len(runs) - len(dated)} of them without GPS time are left out: they have no date")
     own = next(one for one in chosen if one.chosen)
     found = [_assembled(path, run, own) for run in dated or runs]
     notes += _one_after_the_other(found)
-    kept = {**listed(chosen), **({} if dated else {"time_reference": "boot"})}
-    first: dict[str, Any] = {**counts, **({NOTES: "\n".join(notes)} if notes else {})}
     columns = {str(name): dict(one.attrs) for data in found for name, one in data.data_vars.items()}
     for k, data in enumerate(found):
-        whole = same_columns(data, columns).assign_attrs(kept | first)
+        whole = with_notes(same_columns(data, columns).assign_attrs(attrs), notes)
         yield from sliced(uncounted(whole) if k else whole, rows)
 
 

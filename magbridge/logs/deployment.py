@@ -259,6 +259,11 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
     return dataset.assign_attrs(raised)
 
 
+def with_notes(dataset: xr.Dataset, lines: Sequence[str]) -> xr.Dataset:
+    """Return the deployment with further notes for the user."""
+    return dataset.assign_attrs({NOTES: "\n".join([*noted(dataset.attrs), *lines])}) if lines else dataset
+
+
 def with_guesses(path: Path, attrs: Mapping[str, Any], guesses: Sequence[str]) -> dict[str, Any]:
     """Return the attributes with `guesses`, the assumptions under which a file was read, also as history."""
     if not guesses:

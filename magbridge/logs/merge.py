@@ -26,15 +26,14 @@ from magbridge.logs.clocks import BETWEEN_RUNS_S
 from magbridge.logs.compasses import COMPASSES_ATTRIBUTE, further
 from magbridge.logs.deployment import (
     FROM_BOOT,
-    NOTES,
     join,
     join_attrs,
-    noted,
     same_columns,
     shifted,
     sliced,
     uncounted,
     with_losses,
+    with_notes,
 )  # fmt: skip
 from magbridge.logs.fields import CIRCLES, latest, linear
 
@@ -133,8 +132,7 @@ def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: f
             combined.append(log)
     source = ", ".join(dict.fromkeys(str(logs[k].attrs.get("source", "")) for k in sensors))
     note = _note(source, vehicle, np.concatenate(covered), clock_offset_s)
-    first = combined[0].assign_attrs({NOTES: "\n".join([*noted(combined[0].attrs), note])})
-    return [first, *combined[1:]]
+    return [with_notes(combined[0], [note]), *combined[1:]]
 
 
 def _is_from_boot(log: xr.Dataset) -> bool:
@@ -149,9 +147,10 @@ def _in_runs(logs: Sequence[xr.Dataset]) -> list[xr.Dataset]:
         if any(_contradict(one, log) for one in before):
             end = max(float(one["time"].values[-1]) for one in before)
             note = f"{log.attrs['source']}: counts from another boot than the logs before: a run after them"
-            log = shifted(log, end + BETWEEN_RUNS_S - float(log["time"].values[0]))  # noqa: PLW2901
-            log.attrs[NOTES] = "\n".join([*noted(log.attrs), note])
-        placed.append(log)
+            moved = shifted(log, end + BETWEEN_RUNS_S - float(log["time"].values[0]))
+            placed.append(with_notes(moved, [note]))
+        else:
+            placed.append(log)
     return placed
 
 

@@ -283,7 +283,7 @@ def _seaglider(path: Path, file: Any) -> seaglider.Dive:
         name.removeprefix("log_"): float(floats(variable))
         for name, variable in file.variables.items()
         if (name.startswith("log_") or name == "magnetic_variation")
-        if variable.shape == () and variable.dtype != str and variable.dtype.kind in "iuf"
+        if variable.shape == () and _is_number(variable)
     }
     elsewhere = {}
     if "ctd_time" in file.variables:
@@ -298,9 +298,8 @@ def _seaglider(path: Path, file: Any) -> seaglider.Dive:
 
 def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
     """Return the values (size,) of a variable; None if it is missing, not numeric or of another size."""
-    if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
-        return None
-    return floats(file[name]) if file[name].dtype.kind in "iuf" else None
+    there = name in file.variables and file[name].shape == (size,) and _is_number(file[name])
+    return floats(file[name]) if there else None
 
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:

@@ -82,7 +82,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     # pyulog reports damage, but not the number of damaged places
     lost = {"dropouts": len(log.dropouts), "damages": int(log.file_corruption)}
     run = BootRun(mags, _telemetry(topics), _utc_offset(topics))
-    yield from pieces(path, rows, [run], lost, options.compass if options else None)
+    yield from pieces(path, rows, [run], lost, (), options.compass if options else None)
 
 
 def _magnetometers(topics: Topics, parameters: Parameters) -> list[Magnetometer]:

@@ -30,7 +30,6 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT, YEAR_1980
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, sampled
-from magbridge.logs.deployment import NOTES, noted
 from magbridge.logs.fields import euler_deg, field_maps, fields_of
 from magbridge.logs.mapping import Options
 
@@ -88,9 +87,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     boot = float(np.median(mags[0].time)) < YEAR_1980  # the stamps of a simulation begin at 0
     run = BootRun(mags, _telemetry(streams), None if boot else 0.0)
     attrs = {"values_dropped": lost, "history": "\n".join([FRAMES_HISTORY, *notes])}
-    for part in pieces(path, rows, [run], attrs, options.compass if options else None):
-        yield part.assign_attrs({NOTES: "\n".join([*notes, *noted(part.attrs)])}) if notes else part
-        notes = []
+    yield from pieces(path, rows, [run], attrs, notes, options.compass if options else None)
 
 
 def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetometer:

@@ -36,7 +36,7 @@ from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import AGE, CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass, by_columns, choose, compass_notes, listed
-from magbridge.logs.deployment import CHANGES_SETTING, NOTES, deployment, sliced
+from magbridge.logs.deployment import CHANGES_SETTING, deployment, sliced, with_notes
 from magbridge.logs.fields import MAX_AGE, FieldMap, field_maps, fields_of
 from magbridge.logs.mapping import Options
 from magbridge.logs.telemetry_writer import POWER_CYCLE, FileWriter
@@ -209,17 +209,12 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     """Yield the log in pieces of at most `rows` rows."""
     log = TelemetryLog(path)
     wanted = options.compass if options else None
-    compasses = log.compasses() if log.is_plain else []
-    attrs: dict[str, Any] = {**log.attrs, **log.lost}
-    notes = log.notes
-    if compasses:
+    if log.is_plain and (compasses := log.compasses()):
         found = choose(path, compasses, wanted)
         log.source = next(one for one in found if one.chosen).id
-        attrs |= listed(found)
-        notes = [*notes, *compass_notes(found, wanted)]
-    if notes:
-        attrs[NOTES] = "\n".join(notes)
-    whole = deployment(path, *log.table(), attrs=attrs)
+        log.attrs |= listed(found)
+        log.notes += compass_notes(found, wanted)
+    whole = with_notes(deployment(path, *log.table(), attrs=log.attrs | log.lost), log.notes)
     yield from sliced(whole if log.is_plain else by_columns(whole, wanted), rows)
 
 
