@@ -87,10 +87,11 @@ def _in_microseconds(name: str, records: Records) -> Records:
     if "TimeMS" not in records or "TimeUS" in records:
         return records
     if not name.startswith("GPS"):
-        return records.scaled({"TimeUS": ("TimeMS", 1e3)})
+        return Records(records.at, {**records, "TimeUS": 1e3 * records["TimeMS"]})
     if not {"T", "Week"} <= records.keys():
         return records
-    return records.scaled({"TimeUS": ("T", 1e3), "GWk": ("Week", 1.0), "GMS": ("TimeMS", 1.0)})
+    times = {"TimeUS": 1e3 * records["T"], "GWk": records["Week"], "GMS": records["TimeMS"]}
+    return Records(records.at, {**records, **times})
 
 
 def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:

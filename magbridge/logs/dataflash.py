@@ -17,16 +17,14 @@ ArduPilot, "Logs (for developers)", https://ardupilot.org/dev/docs/code-overview
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from functools import partial
-from itertools import chain
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.arrays import BoolArray, IndexArray
 from magbridge.logs.fields import number_of
 
 Bytes = NDArray[np.uint8]
@@ -42,43 +40,23 @@ LETTERS = {
 }  # fmt: skip
 OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 """Letter of a field's type -> factor by which the stored number exceeds the value."""
-FORMAT_LAYOUT = np.dtype([("", "u1", RECORD_HEADER_BYTES),
-                          *zip(("type", "length", "name", "letters", "columns"),
-                                           ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
+FORMAT_LAYOUT = np.dtype("V3, u1, u1, S4, S16, S64")
+"""Layout of a record ``FMT``: header, number, length, name, letters and columns of the described kind."""
 
 
-class Records(Mapping[str, Any]):
-    """Records of one kind by field: numbers or texts (n,) in the unit of the field, decoded when asked for.
+class Records(dict[str, Any]):
+    """Records of one kind: field -> numbers or texts (n,), in the unit of the field.
 
     `at` (n,): position of each record in the file, increasing: its first byte, or its line in a text.
-    `decoders`: field -> function that returns the values at such positions.
     """
 
-    def __init__(self, positions: IndexArray, decoders: Mapping[str, Callable[[IndexArray], Any]]) -> None:
-        self.at, self._decoders = positions, decoders
+    def __init__(self, at: IndexArray, fields: Mapping[str, Any]) -> None:
+        super().__init__(fields)
+        self.at = at
 
-    def __getitem__(self, field: str) -> Any:
-        return self._decoders[field](self.at)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._decoders)
-
-    def __len__(self) -> int:
-        return len(self._decoders)
-
-    def part(self, chosen: slice | BoolArray) -> Records:
+    def part(self, chosen: slice | BoolArray | IndexArray) -> Records:
         """Return some of the records."""
-        return Records(self.at[chosen], self._decoders)
-
-    def scaled(self, sources: Mapping[str, tuple[str, float]]) -> Records:
-        """Return the records with further fields: name -> field that holds the numbers, and a factor."""
-        further = {name: partial(_scaled, self._decoders[field], factor)
-                   for name, (field, factor) in sources.items()}  # fmt: skip
-        return Records(self.at, {**self._decoders, **further})
-
-
-def _scaled(decoder: Callable[[IndexArray], Any], factor: float, starts: IndexArray) -> FloatArray:
-    return np.asarray(factor * decoder(starts))
+        return Records(self.at[chosen], {name: values[chosen] for name, values in self.items()})
 
 
 class Flash(NamedTuple):
@@ -130,7 +108,7 @@ def read_binary(path: Path, wanted: Collection[str]) -> Flash:
         ends = np.searchsorted(here, [kind.since for kind in described[1:]])
         for kind, positions in zip(described, np.split(here, ends), strict=True):
             if kind.name in wanted and len(positions):
-                pieces.setdefault(kind.name, []).append(Records(positions, _decoders(data, kind)))
+                pieces.setdefault(kind.name, []).append(_decoded(data, kind, positions))
                 fields = zip(kind.columns, kind.letters, strict=False)
                 letters |= {(kind.name, name): letter for name, letter in fields}
     records = {name: _joined(found) for name, found in pieces.items()}
@@ -139,21 +117,12 @@ def read_binary(path: Path, wanted: Collection[str]) -> Flash:
 
 def _joined(pieces: Sequence[Records]) -> Records:
     """Return records of one kind that several descriptions read, with the fields that all of them have."""
-    first, *others = pieces
-    if not others:
-        return first
-
-    def values(field: str, starts: IndexArray) -> Any:
-        chosen = [part.part(np.isin(part.at, starts)) for part in pieces]
-        found = [[*part[field]] for part in chosen]
-        order = np.argsort(np.concatenate([part.at for part in chosen]))
-        together = [*chain(*found)]
-        in_order = [together[k] for k in order.tolist()]
-        return in_order if in_order and isinstance(in_order[0], str) else np.array(in_order, float)
-
-    shared = [field for field in first if all(field in other for other in others)]
-    positions = np.sort(np.concatenate([part.at for part in pieces]))
-    return Records(positions, {field: partial(values, field) for field in shared})
+    shared = [field for field in pieces[0] if all(field in other for other in pieces)]
+    whole = Records(
+        np.concatenate([part.at for part in pieces]),
+        {field: np.concatenate([part[field] for part in pieces]) for field in shared},
+    )
+    return whole.part(np.argsort(whole.at)) if len(pieces) > 1 else whole
 
 
 def _kinds(data: Bytes, headers: IndexArray) -> dict[int, list[_Kind]]:
@@ -165,14 +134,14 @@ def _kinds(data: Bytes, headers: IndexArray) -> dict[int, list[_Kind]]:
     at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
     at = at[data[at + 2] == FMT]
     kinds: dict[int, list[_Kind]] = {}
-    for start, one in zip(at.tolist(), _gather(data, at, FORMAT_LAYOUT), strict=True):
-        name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
-        size = int(one["length"])
+    described = _gather(data, at, FORMAT_LAYOUT).tolist()
+    for start, (_, number, size, *texts) in zip(at.tolist(), described, strict=True):
+        name, letters, columns = (text.decode("latin-1") for text in texts)
         known = all(letter in LETTERS for letter in letters)
         sizes = [np.dtype(LETTERS[letter]).itemsize for letter in letters] if known else []
         is_sound = not known or RECORD_HEADER_BYTES + sum(sizes) == size
         if is_sound and size > RECORD_HEADER_BYTES and name.isalnum():
-            before = kinds.setdefault(int(one["type"]), [])
+            before = kinds.setdefault(number, [])
             kind = _Kind(start if before else 0, size, name, letters, columns.split(","))
             if not before or before[-1][1:] != kind[1:]:
                 before.append(kind)
@@ -218,25 +187,22 @@ def _gather(data: Bytes, starts: IndexArray, layout: np.dtype[Any], offset: int 
     return taken.view(layout)[:, 0] if len(starts) else np.empty(0, layout)
 
 
-def _decoders(data: Bytes, kind: _Kind) -> dict[str, Callable[[IndexArray], Any]]:
-    """Return field -> function that returns its values (n,) in the records that begin at given bytes."""
-    found: dict[str, Callable[[IndexArray], Any]] = {}
+def _decoded(data: Bytes, kind: _Kind, starts: IndexArray) -> Records:
+    """Return the records of a kind that begin at the bytes `starts` (n,)."""
+    fields: dict[str, Any] = {}
     offset = RECORD_HEADER_BYTES
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
         if letter not in LETTERS or offset + layout.itemsize > kind.length:
             break  # a field of an unknown letter has no known length, so the next has no known start
-        if layout.kind != "V":
-            found[name] = partial(_values, data, layout, offset, OWN_SCALE.get(letter, 1.0))
+        if layout.kind == "S":
+            texts = _gather(data, starts, layout, offset)
+            fields[name] = np.array([text.decode("latin-1") for text in texts], str)
+        elif layout.kind != "V":
+            numbers = _gather(data, starts, layout, offset).astype(np.float64)
+            fields[name] = numbers / OWN_SCALE.get(letter, 1.0)
         offset += layout.itemsize
-    return found
-
-
-def _values(data: Bytes, layout: np.dtype[Any], offset: int, scale: float, starts: IndexArray) -> Any:
-    found = _gather(data, starts, layout, offset)
-    if layout.kind == "S":
-        return [text.decode("latin-1") for text in found]
-    return found.astype(np.float64) / scale
+    return Records(starts, fields)
 
 
 TEXT_TYPES = frozenset("nNZaM")
@@ -261,14 +227,11 @@ def read_text(path: Path, wanted: Collection[str]) -> Flash:
     records: dict[str, Records] = {}
     letters: dict[tuple[str, str], str] = {}
     for name, lines in rows.items():
-        fields = list(enumerate(zip(described[name][1], described[name][0], strict=False)))
-        letters |= {(name, column): letter for _, (column, letter) in fields}
-        decoders = {column: partial(_cells, lines, k, letter) for k, (column, letter) in fields}
-        records[name] = Records(np.array([*lines], dtype=np.intp), decoders)
+        fields: dict[str, Any] = {}
+        for column, letter, *texts in zip(
+            described[name][1], described[name][0], *lines.values(), strict=False
+        ):
+            letters[name, column] = letter
+            fields[column] = np.array(texts if letter in TEXT_TYPES else [number_of(text) for text in texts])
+        records[name] = Records(np.array([*lines], dtype=np.intp), fields)
     return Flash(records, letters, skipped)
-
-
-def _cells(lines: Mapping[int, Sequence[str]], k: int, letter: str, numbers: IndexArray) -> Any:
-    """Return the values of field `k` in the rows with line `numbers` (n,)."""
-    texts = [lines[number][k] for number in numbers.tolist()]
-    return texts if letter in TEXT_TYPES else np.array([number_of(text) for text in texts])
