@@ -295,7 +295,12 @@ def _beginning(path: Path) -> tuple[list[str], str | None, int]:
     """
     remarks: list[str] = []
     with path.open(**TEXT_OPTIONS) as file:
-        first = next((line for line in file if not _is_remark(line, remarks)), "")
+        for first in file:
+            if not REMARK.match(first):
+                break
+            remarks.append(first)
+        else:
+            first = ""
     delimiter = next((mark for mark in ",;\t" if mark in first), None)
     candidates = [first, *(line.strip().lstrip("#%/") for line in reversed(remarks))]
     rows = [[word.strip() for word in line.strip().lower().split(delimiter)] for line in candidates]
@@ -306,14 +311,6 @@ def _beginning(path: Path) -> tuple[list[str], str | None, int]:
     if all(NUMBER_PATTERN.fullmatch(word) for word in words):
         return next(named, words), delimiter, len(remarks)
     return words, delimiter, len(remarks) + 1
-
-
-def _is_remark(line: str, remarks: list[str]) -> bool:
-    """Return True if the line is a comment, empty or a line's heading; append it to `remarks` then."""
-    found = REMARK.match(line) is not None
-    if found:
-        remarks.append(line)
-    return found
 
 
 def _named(path: Path, words: list[str]) -> list[GridColumn]:

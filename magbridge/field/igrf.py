@@ -12,13 +12,13 @@ nT up to 70 deg of latitude, at a hundredth of the cost. Nearer to a pole the me
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,12 +82,8 @@ def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: Arra
     _refuse("latitude", lat, -90.0, 90.0, "deg, -90 to 90")
     _refuse("longitude", lon, -180.0, 360.0, "deg, -180 to 360")
     start, end = model.epochs[0], model.epochs[-1]
-    if bad := _outside(at, start, end):
-        raise OutOfRange(
-            "time",
-            _date(bad[0]),
-            f"the IGRF covers {_date(start)} to {_date(end)}; pip install -U ppigrf updates it",
-        )
+    covered = f"the IGRF covers {_date(start)} to {_date(end)}; pip install -U ppigrf updates it"
+    _refuse("time", at, start, end, covered, _date)
     field = np.empty((lat.size, 3))
     for i in range(0, lat.size, IGRF_BLOCK_SAMPLES):
         part = slice(i, i + IGRF_BLOCK_SAMPLES)
@@ -219,13 +215,16 @@ def _geocentric(latitude: FloatArray, height: FloatArray) -> tuple[FloatArray, F
     return np.hypot(axis, polar), np.arctan2(polar, axis)
 
 
-def _outside(values: FloatArray, low: float, high: float) -> list[float]:
-    return [float(value) for value in values[(values < low) | (values > high)][:1]]
-
-
-def _refuse(quantity: str, values: FloatArray, low: float, high: float, covered: str) -> None:
-    if bad := _outside(values, low, high):
-        raise OutOfRange(quantity, bad[0], covered)
+def _refuse(
+    quantity: str,
+    values: FloatArray,
+    low: float,
+    high: float,
+    covered: str,
+    shown: Callable[[float], Any] = float,
+) -> None:
+    if (bad := values[(values < low) | (values > high)]).size:
+        raise OutOfRange(quantity, shown(bad[0]), covered)
 
 
 def _date(time: float) -> str:

@@ -158,6 +158,10 @@ def _plugins() -> dict[str, Format]:
     }
 
 
+def _formats() -> list[Format]:
+    return [*FORMATS.values(), *_plugins().values()]
+
+
 def _writes(point: EntryPoint) -> bool:
     """Return True if another package's format can be written, False also if its module fails to load."""
     try:
@@ -168,8 +172,7 @@ def _writes(point: EntryPoint) -> bool:
 
 def suffixes(*, write: bool = False) -> list[str]:
     """Return the suffixes of files that can be read, or if `write`, that can be written."""
-    formats = [*FORMATS.values(), *_plugins().values()]
-    return sorted({suffix for one in formats for suffix in one.suffixes if one.writes or not write})
+    return sorted({suffix for one in _formats() for suffix in one.suffixes if one.writes or not write})
 
 
 def format_of(path: Path, *, write: bool = False) -> Format:
@@ -178,13 +181,9 @@ def format_of(path: Path, *, write: bool = False) -> Format:
     FormatError: neither its first bytes nor its name are those of a known format.
     """
     start = b"" if write or is_bag(path) else _start(path)
-    signed = [one for one in FORMATS.values() if one.signature is not None]
-    found = next((one for one in signed if re.match(one.signature or b"", start, re.DOTALL)), None)
-    found = FORMATS["ros"] if is_bag(path) else found
-    packed = False
-    if not write and path.is_file():
-        with path.open("rb") as file:
-            packed = file.read(6).startswith(tuple(PACKERS))
+    signed = (one for one in _formats() if one.signature and re.match(one.signature, start, re.DOTALL))
+    found = FORMATS["ros"] if is_bag(path) else next(signed, None)
+    packed = not write and path.is_file() and _unpacker(path) is not None
     if found is None and (
         other := next((text for mark, text in UNREADABLE.items() if re.match(mark, start)), None)
     ):
@@ -196,8 +195,7 @@ def format_of(path: Path, *, write: bool = False) -> Format:
         suffix = double if double in known else name.suffix.lower()
         if suffix not in known:
             raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
-        formats = [*FORMATS.values(), *_plugins().values()]
-        found = next(one for one in formats if suffix in one.suffixes and (one.writes or not write))
+        found = next(one for one in _formats() if suffix in one.suffixes and (one.writes or not write))
     if packed and not found.packed:
         raise FormatError(path, "expected a log, it is compressed: unpack it first")
     return found
@@ -230,10 +228,14 @@ DECOMPRESSION_ERRORS = EOFError, zlib.error, lzma.LZMAError
 """Errors that damaged compressed files cause, in addition to OSError."""
 
 
-def opened(path: Path) -> IO[bytes]:
-    """Open a file to read its bytes, decompressed if it is compressed."""
+def _unpacker(path: Path) -> Any:
+    """Return the function that opens a compressed file; None for a file that is not compressed."""
     with path.open("rb") as file:
         start = file.read(6)
-    unpack = next((unpack for mark, unpack in PACKERS.items() if start.startswith(mark)), Path.open)
-    opened_file: IO[bytes] = unpack(path, "rb")
+    return next((unpack for mark, unpack in PACKERS.items() if start.startswith(mark)), None)
+
+
+def opened(path: Path) -> IO[bytes]:
+    """Open a file to read its bytes, decompressed if it is compressed."""
+    opened_file: IO[bytes] = (_unpacker(path) or Path.open)(path, "rb")
     return opened_file

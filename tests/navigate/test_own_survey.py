@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from msgspec import structs
+from rock import Rock
 
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
@@ -27,8 +28,7 @@ def flown(*, straight: bool) -> xr.Dataset:
     drift = np.outer(time, [0.03, -0.02])
     latitude, longitude = offset(*START, true[:, 0], true[:, 1])
     dr_latitude, dr_longitude = offset(*START, *(true - drift).T)
-    k, phase = rng.normal(0, 1 / 700.0, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
-    rock: FloatArray = 40.0 * np.sqrt(2 / 400) * np.cos(true @ k.T + phase).sum(axis=1)
+    rock = Rock(rng, 40.0, 700.0, 400).at(true)
     when = 1.4e9 + time
     field = total_field(longitude, latitude, 0.0, when) + rock + rng.normal(0, 1.0, len(time))
     columns = {

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rock import Rock
 
 from magbridge.arrays import FloatArray
 from magbridge.estimation.residual import rms
@@ -14,19 +15,11 @@ ASTRAY, OFF = 11, 300.0
 """The line that was flown elsewhere than it says, and how many m."""
 
 
-class Rock:
-    """Sources in a layer: waves of random directions and numbers k, with the power k exp(-2 k d)."""
-
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        k, way = rng.uniform(0.0, 6.0 / BELOW, 600), rng.uniform(0.0, 2.0 * np.pi, 600)
-        power = k * np.exp(-2.0 * k * BELOW)
-        self.amplitude = SIZE * np.sqrt(2.0 * power / power.sum())
-        self.k = k[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
-        self.phase = rng.uniform(0.0, 2.0 * np.pi, 600)
-
-    def at(self, place: FloatArray) -> FloatArray:
-        return np.asarray(np.cos(place @ self.k.T + self.phase) @ self.amplitude)
+def layer(seed: int) -> Rock:
+    """Return sources in a layer: waves of random directions and numbers k, with the power k exp(-2 k d)."""
+    rng = np.random.default_rng(seed)
+    k, (way, phase) = rng.uniform(0.0, 6.0 / BELOW, 600), rng.uniform(0.0, 2.0 * np.pi, (2, 600))
+    return Rock.of_waves(SIZE, k, way, phase, k * np.exp(-2.0 * k * BELOW))
 
 
 def surveyed(rock: Rock) -> Samples:
@@ -44,7 +37,7 @@ def surveyed(rock: Rock) -> Samples:
 
 @pytest.fixture(scope="module")
 def found() -> tuple[Rock, Samples, Kriged]:
-    rock = Rock(5)
+    rock = layer(5)
     samples = surveyed(rock)
     return rock, samples, kriged(samples, samples.value, 2.0 * BELOW)
 

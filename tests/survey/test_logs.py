@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
+from rock import Rock
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
@@ -30,11 +31,7 @@ IRON = {
 """nT: the hard iron of each vehicle, and by how much its calibration makes the field too large."""
 
 
-def rock(place: FloatArray) -> FloatArray:
-    """Return nT (n,) at places (n, 2), m: 50 nT over 900 m."""
-    rng = np.random.default_rng(5)
-    k, phase = rng.normal(0, 1 / 900.0, (500, 2)), rng.uniform(0, 2 * np.pi, 500)
-    return np.asarray(50.0 * np.sqrt(2 / 500) * np.cos(place @ k.T + phase).sum(axis=1))
+rock = Rock(np.random.default_rng(5), 50.0, 900.0).at
 
 
 def lanes(axis: int, count: int = 6) -> FloatArray:

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 from commands import Command
 from pages import blocks, commands
+from rock import Rock
 from scipy.spatial.transform import Rotation
 
 import magbridge as mb
@@ -36,13 +37,6 @@ class Grid(NamedTuple):
     line: IndexArray
 
 
-def rock(random: np.random.Generator, depth: float) -> tuple[FloatArray, FloatArray]:
-    """Return wave numbers (m, 2) and phases of sources at random `depth` m below the sensor."""
-    wave = random.gamma(2.0, 0.5 / depth, 400)
-    angle = random.uniform(0.0, 2 * np.pi, 400)
-    return np.stack([wave * np.cos(angle), wave * np.sin(angle)], axis=1), random.uniform(0, 2 * np.pi, 400)
-
-
 def grid(
     seed: int = 1,
     depth: float = 150.0,
@@ -58,7 +52,8 @@ def grid(
     height is within `rise` m of 80 m.
     """
     random = np.random.default_rng(seed)
-    waves, phases = rock(random, depth)
+    # sources at random depths below the sensor
+    rock = Rock.of_waves(50.0, random.gamma(2.0, 0.5 / depth, 400), *random.uniform(0.0, 2 * np.pi, (2, 400)))
     along = np.arange(0.0, side, SPEED_M_S / RATE_HZ)
     place, heading, line, time = [], [], [], []
     starts = [(across, 0.0) for across in np.arange(0.0, side + 1, 100.0)]
@@ -81,8 +76,7 @@ def grid(
     arm = [forward * np.cos(psi) - starboard * np.sin(psi), forward * np.sin(psi) + starboard * np.cos(psi)]
     sensor = position - LAG_S * velocity + np.stack(arm, axis=1)
     deeper = rise * np.sin(np.arange(len(psi)) / 6.0)
-    growth = np.exp(deeper[:, None] * np.linalg.norm(waves, axis=1))
-    truth = 50.0 * np.sqrt(2 / len(waves)) * (growth * np.cos(sensor @ waves.T + phases)).sum(axis=1)
+    truth = rock.at(sensor, deeper)
     latitude, longitude = offset(*ORIGIN, position[:, 0], position[:, 1])
     clocks = np.concatenate(time)
     reading = magnitude(igrf(longitude, latitude, deeper - 80.0, clocks)) + truth

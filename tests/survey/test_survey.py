@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import Command
 from msgspec import structs
+from rock import Rock
 from voyages import GLIDER, PLACE, Map, sail, synthetic, track_over
 
 from magbridge.arrays import FloatArray
@@ -26,15 +27,8 @@ ORIGIN = 49.5, -57.9
 NOISE = 1.5
 
 
-class Rock:
-    """A Gaussian field of 50 nT over 900 m."""
-
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        self.k, self.phase = rng.normal(0, 1 / 900.0, (500, 2)), rng.uniform(0, 2 * np.pi, 500)
-
-    def at(self, place: FloatArray) -> FloatArray:
-        return np.asarray(50.0 * np.sqrt(2 / 500) * np.cos(place @ self.k.T + self.phase).sum(axis=1))
+def rock_of(seed: int) -> Rock:
+    return Rock(np.random.default_rng(seed), 50.0, 900.0)
 
 
 def lines(rock: Rock, rng: np.random.Generator) -> Samples:
@@ -55,7 +49,7 @@ def lines(rock: Rock, rng: np.random.Generator) -> Samples:
 
 @pytest.fixture(scope="module")
 def done() -> tuple[Rock, Result]:
-    rock = Rock(5)
+    rock = rock_of(5)
     return rock, survey(lines(rock, np.random.default_rng(6)))
 
 
@@ -132,8 +126,7 @@ def test_a_map_is_continued_upward_with_its_sigma(done: tuple[Rock, Result]) -> 
     assert grid.sigma is not None
     y, x = np.meshgrid(grid.latitude, grid.longitude, indexing="ij")
     place = np.stack(separation(*ORIGIN, y.ravel(), x.ravel()), axis=1)
-    fallen = np.exp(-600.0 * np.linalg.norm(rock.k, axis=1))
-    true = 50.0 * np.sqrt(2 / 500) * (np.cos(place @ rock.k.T + rock.phase) * fallen).sum(axis=1)
+    true = rock.at(place, -600.0)
     off, sigma = grid.anomaly.ravel() - true, grid.sigma.ravel()
     middle, edge = (np.abs(place) < 1500.0).all(axis=1), (np.abs(place) < 2700.0).all(axis=1)
     edge &= ~middle
@@ -152,15 +145,9 @@ def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
     course = np.cumsum(rng.uniform(1.5, 3.0, legs))[np.arange(n) * legs // n]
     place = np.cumsum(4.0 * np.stack([np.cos(course), np.sin(course)], axis=1), axis=0)
     depth = 140.0 * np.abs(np.arange(n) % 300 / 150.0 - 1.0)
-    k, way = rng.gamma(4.0, 1 / 2000.0, 1500), rng.uniform(0.0, 2.0 * np.pi, 1500)
-    phase, middle = rng.uniform(0.0, 2.0 * np.pi, 1500), float(np.median(depth))
-    waves = np.stack([k * np.cos(way), k * np.sin(way)])
-
-    def rock(at: FloatArray, deep: FloatArray | float) -> FloatArray:
-        falling = np.exp(np.multiply.outer(np.broadcast_to(np.asarray(deep, float), len(at)) - middle, k))
-        return np.asarray(40.0 * np.sqrt(2 / 1500) * (falling * np.cos(at @ waves + phase)).sum(axis=1))
-
-    value = rock(place, depth) + rng.normal(0.0, 1.0, n)
+    number, (way, phase) = rng.gamma(4.0, 1 / 2000.0, 1500), rng.uniform(0.0, 2.0 * np.pi, (2, 1500))
+    rock, middle = Rock.of_waves(40.0, number, way, phase), float(np.median(depth))
+    value = rock.at(place, depth - middle) + rng.normal(0.0, 1.0, n)
     zero = np.zeros(n, int)
     result = survey(Samples(place, depth, np.arange(4.0, 4 * n + 4, 4), value, zero, zero > 0, ORIGIN))
     found = result.gridded
@@ -171,8 +158,8 @@ def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
     assert "misties_remain" not in [warning.code for warning in result.warnings]
     at = place[rng.integers(n, size=400)] + rng.normal(0.0, 250.0, (400, 2))
     anomaly, sigma = found.evaluate(at)
-    error = anomaly - rock(at, middle)
-    error -= np.mean(found.evaluate(place[::10])[0] - rock(place[::10], middle))
+    error = anomaly - rock.at(at)
+    error -= np.mean(found.evaluate(place[::10])[0] - rock.at(place[::10]))
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
     assert np.sqrt(np.mean(error**2)) < 2.2
 
@@ -183,8 +170,7 @@ def zigzag(rng: np.random.Generator, *, back: bool) -> tuple[Samples, FloatArray
     leg = np.arange(n) * legs // n
     course = np.radians(np.where(leg % 2, 50.0, -50.0) + 180.0 * (back & (leg >= legs // 2)))
     place: FloatArray = 4.0 * np.cumsum(np.stack([np.cos(course), np.sin(course)], axis=1), axis=0)
-    k, phase = rng.normal(0, 1 / 900.0, (300, 2)), rng.uniform(0, 2 * np.pi, 300)
-    rock = 30.0 * np.sqrt(2 / 300) * np.cos(place @ k.T + phase).sum(axis=1)
+    rock = Rock(rng, 30.0, 900.0, 300).at(place)
     time, zero = np.linspace(0.0, 10_800.0, n), np.zeros(n, int)
     value = rock + rng.normal(0, 1.0, n)
     change = 4.0 * np.cos(np.pi * time / time[-1])
@@ -229,7 +215,7 @@ def test_crustal_field_is_searched_over_more_than_the_middle_of_a_dense_log(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A hundred samples a kilometre: the few about the middle one are on one leg, which tells no length."""
-    rng, rock = np.random.default_rng(8), Rock(8)
+    rng, rock = np.random.default_rng(8), rock_of(8)
     corners = rng.uniform(-3000.0, 3000.0, (8, 2))
     at = np.concatenate([np.linspace(a, b, 500) for a, b in pairwise(corners)])
     n = len(at)
@@ -265,7 +251,7 @@ def test_crossing_is_where_the_lines_cross() -> None:
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    samples = lines(Rock(5), np.random.default_rng(6))
+    samples = lines(rock_of(5), np.random.default_rng(6))
     latitude, longitude = offset(*ORIGIN, samples.place[:, 0], samples.place[:, 1])
     kind = np.where(samples.tie, "TIE", "LINE")
     rows = zip(longitude, latitude, samples.value, samples.line, kind, strict=True)
@@ -296,7 +282,7 @@ def test_command_makes_a_map_that_navigate_reads(command: Command, table: Path) 
     assert facts["crossovers"] == 30
     assert facts["misties_after_nT"] < 0.2 * facts["misties_before_nT"]
     grid = read_grid(out / "map.nc")
-    rock = Rock(5)
+    rock = rock_of(5)
     y, x = np.meshgrid(grid.latitude[20:-20], grid.longitude[20:-20], indexing="ij")
     north, east = separation(*ORIGIN, y.ravel(), x.ravel())
     inner = (np.abs(north) < 2500) & (np.abs(east) < 2500)
