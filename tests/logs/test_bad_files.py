@@ -39,9 +39,7 @@ BAD_CSV = {
     "time,mag_x\n2,2\n1,3\n": "row 3, column 'time': expected a time after 2.0, not 1.0",
     "time,mag_x\n2,2\n2,3\n": "row 3, column 'time': expected a time after 2.0, not 2.0",
     "time,mag_x\n2016-06-23,2\nlater,3\n": "row 3, column 'time': expected a time, not 'later'",
-    "time,mag_x\n1.5,2\n2016-06-23,3\n": (
-        "row 3, column 'time': expected seconds since 1970, not '2016-06-23'"
-    ),
+    "time,a\n1.5,2\n2016-06-23,3\n": "row 3, column 'time': expected seconds since 1970, not '2016-06-23'",
     "time,mag_x\n3/4/2022 12:00,2\n3/4/2022 12:01,2\n": (
         "column 'time': day or month first? '3/4/2022 12:00' can be both: "
         '--column time="time [%d/%m/%Y %H:%M]" or --column time="time [%m/%d/%Y %H:%M]"'
@@ -55,9 +53,7 @@ BAD_CSV = {
     "# heading_reference = Magnetic\ntime,heading\n1,2\n": (
         "heading_reference: expected true, magnetic or inertial, not 'Magnetic'"
     ),
-    "# heading_reference = magnetic\ntime,mag_x\n1,2\n\n2,x\n": (
-        "row 5, column 'mag_x': expected a number, not 'x'"
-    ),
+    "# heading_reference = magnetic\ntime,a\n1,2\n\n2,x\n": "row 5, column 'a': expected a number, not 'x'",
 }
 
 
@@ -104,15 +100,12 @@ def test_csv_of_endless_zeros_is_not_held(header: str, words: str, tmp_path: Pat
     assert words in refused(path)
     assert tracemalloc.get_traced_memory()[1] < 30e6
     tracemalloc.stop()
-
-
-def test_csv_that_ends_in_the_zeros_of_a_crash(tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
+    # a log that ends in the zeros of a crash is read up to there
     path.write_text("time,mag_x\n1,2\n2,3\n3,4\n")
     os.truncate(path, 2_000_000)
-    read = logs.read(path)
-    assert read["mag_x"].values.tolist() == [2, 3, 4]
-    assert passed_over(read.attrs) == {"rows_dropped": 1}
+    log = logs.read(path)
+    assert log["mag_x"].values.tolist() == [2, 3, 4]
+    assert passed_over(log.attrs) == {"rows_dropped": 1}
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -61,14 +61,9 @@ def test_variables_of_another_length_than_their_times_are_left_out(tmp_path: Pat
     assert set(dive(path, gc_end_secs=("ctd_data_point", np.zeros(3)))) == whole - {"vbd_current"}
     with pytest.raises(FormatError, match="column 'eng_mag_y': expected this variable, as of a Seaglider"):
         dive(path, eng_mag_y=short)
-
-
-def test_a_dive_whose_compass_was_not_logged_raw(tmp_path: Path) -> None:
-    """Most Seagliders': attitude and masses can still be planned with, and simulated."""
-    short = dict.fromkeys((f"eng_mag_{axis}" for axis in "xyz"), ("gc_event", np.zeros(2)))
-    read = dive(tmp_path / "p1670001.nc", **short)
-    assert {"heading", "longitude", "vbd_current"} <= set(read)
-    assert not {"mag_x", "mag_y", "mag_z"} & set(read)
+    # most Seagliders log no raw compass: attitude and masses can still be planned with, and simulated
+    read = dive(path, **dict.fromkeys((f"eng_mag_{axis}" for axis in "xyz"), short))
+    assert set(read) == whole - {*CHANNELS}
     assert "no raw compass" in "".join(named_losses(read.attrs))
 
 
@@ -244,11 +239,7 @@ nonsense
 @pytest.mark.parametrize(("elements", "first"), [("XYZF", 3.0), ("HDZF", 3.0), ("XYZS", 3.0)])
 def test_an_observatory(elements: str, first: float, tmp_path: Path) -> None:
     path = tmp_path / "mde20240510vmin.min"
-    rows = [
-        "3000.00 4000.00 12000.00 13000.00",
-        "3000.00 4000.00 12000.00 99999.00",
-        " ".join(["99999.00"] * 4),
-    ]
+    rows = ["3000.00 4000.00 12000.00 13000.00", "3000.00 4000.00 12000.00 99999.00", "99999.00 " * 4]
     heads = "   ".join(f"MDE{one}" for one in elements)
     path.write_text(IAGA.format(elements=elements, heads=heads, rows=rows))
     back = logs.read(path)
@@ -269,29 +260,21 @@ dbdreader = pytest.importorskip("dbdreader")
 T0_SLOCUM = 1_704_067_200.0
 
 
-def flight(n: int = 50, start: float = T0_SLOCUM) -> dict[str, np.ndarray]:
-    k = np.arange(float(n))
-    return {
-        "m_present_time": start + 4.0 * k,
-        "m_depth": 0.5 * k,
-        "m_battpos": np.cos(k),
-        "m_pitch": 0.4 * np.sin(k),
-    }
-
-
-def science(n: int = 50) -> dict[str, np.ndarray]:
-    k = np.arange(float(n))
-    started = k > 3
-    return {
-        "sci_m_present_time": T0_SLOCUM + 1.0 + 4.0 * k,
-        "sci_water_temp": np.where(started, 9.0 + 0.01 * k, 0.0),
-        "sci_water_pressure": np.where(started, 0.05 * k, 0.0),
-    }
+K = np.arange(50.0)
+FLIGHT = {
+    "m_present_time": T0_SLOCUM + 4.0 * K, "m_depth": 0.5 * K, "m_battpos": np.cos(K),
+    "m_pitch": 0.4 * np.sin(K),
+}  # fmt: skip
+SCIENCE = {
+    "sci_m_present_time": T0_SLOCUM + 1.0 + 4.0 * K,
+    "sci_water_temp": np.where(K > 3, 9.0 + 0.01 * K, 0.0),
+    "sci_water_pressure": np.where(K > 3, 0.05 * K, 0.0),
+}
 
 
 def test_every_column_is_dbdreaders(tmp_path: Path) -> None:
-    segment(tmp_path / "a.sbd", flight())
-    segment(tmp_path / "a.tbd", science())
+    segment(tmp_path / "a.sbd", FLIGHT)
+    segment(tmp_path / "a.tbd", SCIENCE)
     back = logs.read(tmp_path / "a.sbd")
     other = dbdreader.DBD(str(tmp_path / "a.sbd"))
     for theirs, ours, factor in (
@@ -304,20 +287,16 @@ def test_every_column_is_dbdreaders(tmp_path: Path) -> None:
     back = logs.read(tmp_path / "a.tbd")
     assert (back["water_temperature"] > 9.0).all()
     assert float(back["water_pressure"].min()) == 0.05 * 4
-
-
-def test_a_temperature_of_zero_at_depth_is_one(tmp_path: Path) -> None:
-    measured = science() | {"sci_water_temp": np.zeros(50)}
-    segment(tmp_path / "a.tbd", measured)
-    back = logs.read(tmp_path / "a.tbd")
-    assert (back["water_temperature"] == 0.0).all()
+    # a temperature of zero at depth is one
+    segment(tmp_path / "a.tbd", SCIENCE | {"sci_water_temp": np.zeros(50)})
+    assert (logs.read(tmp_path / "a.tbd")["water_temperature"] == 0.0).all()
 
 
 @pytest.mark.parametrize("folder", [".", "cac", "../cac", "cache"])
 def test_the_list_of_sensors_may_be_in_a_folder(folder: str, tmp_path: Path) -> None:
     logged = tmp_path / "logs"
     logged.mkdir()
-    segment(logged / "a.sbd", flight(), factored=True)
+    segment(logged / "a.sbd", FLIGHT, factored=True)
     (logged / folder).mkdir(exist_ok=True)
     (logged / f"{CRC}.cac").rename(logged / folder / f"{CRC}.cac")
     assert logs.read(logged / "a.sbd")["battpos"].notnull().all()

@@ -20,9 +20,8 @@ T0 = 1.7e9
 def counted(time: np.ndarray, rows: int = 1000) -> tuple[list[float], dict[str, int], list[str]]:
     """Check a log with these times; return the remaining times, the counts and the messages."""
     whole = deployment("log.csv", time, {"mag_x": np.arange(float(len(time)))})
-    pieces = [
-        (whole.isel(time=slice(k, k + rows)), range(k + 1, k + 1 + rows)) for k in range(0, len(time), rows)
-    ]
+    starts = range(0, len(time), rows)
+    pieces = [(whole.isel(time=slice(k, k + rows)), range(k + 1, k + 1 + rows)) for k in starts]
     sound = list(checked("log.csv", pieces))
     attrs = [piece.attrs for piece in sound]
     return [t for piece in sound for t in piece["time"].values], passed_over(*attrs), named_losses(*attrs)
@@ -109,9 +108,9 @@ def test_strict_refuses_rows_that_two_files_repeat(tmp_path: Path) -> None:
     """But not rows that complete each other."""
     x, strict = np.linspace(2e4, 3e4, 100), logs.Options(strict=True)
     paths = [text(tmp_path / "a.csv", T0, x), text(tmp_path / "b.csv", T0 + 80.0, x[80:])]
-    for read in (logs.read, lambda *args, **kwargs: list(logs.read_chunks(*args, **kwargs))):
+    for read in (logs.read, logs.read_chunks):
         with pytest.raises(FormatError, match=r"a\.csv, b\.csv: expected logs without"):
-            read(paths, options=strict)
+            list(read(paths, options=strict))
     lines = [f"{T0 + k},{k}" for k in range(100)]
     (tmp_path / "d.csv").write_text("\n".join(["time,depth [m]", *lines]))
     for one in both_ways([paths[0], tmp_path / "d.csv"], strict=True):
@@ -143,20 +142,18 @@ def made(folder: Path, n: int, bad: tuple[int, ...]) -> list[Path]:
 
 def test_three_bad_files_of_forty(tmp_path: Path) -> None:
     paths = made(tmp_path, 40, (0, 17, 39))
+    bad = [paths[k] for k in (0, 17, 39)]
     whole = logs.read(paths)
     pieces = list(logs.read_chunks(paths, 30))
     for attrs in ([whole.attrs], [piece.attrs for piece in pieces]):
         assert passed_over(*attrs) == {"files_skipped": 3}
-        assert named_losses(*attrs) == [
-            f"{paths[k]}: row 2: expected rows after the header" for k in (0, 17, 39)
-        ]
+        assert named_losses(*attrs) == [f"{path}: row 2: expected rows after the header" for path in bad]
     assert whole.sizes["time"] == sum(piece.sizes["time"] for piece in pieces) == 370
     with pytest.raises(FormatError, match=r"000\.csv"):
         logs.read(paths, options=logs.Options(strict=True))
-    bad = [paths[k] for k in (0, 17, 39)]
-    for read in (logs.read, lambda paths: list(logs.read_chunks(paths))):
+    for read in (logs.read, logs.read_chunks):
         with pytest.raises(FormatError, match="expected rows after the header"):
-            read(bad)
+            list(read(bad))
 
 
 def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
@@ -191,9 +188,8 @@ def test_a_file_is_what_its_bytes_say(tmp_path: Path) -> None:
 
 
 def test_a_date_moves_times_that_count_from_the_boot(tmp_path: Path) -> None:
-    rows = deployment(
-        "made", 5.0 + np.arange(5.0), {"mag_x": np.arange(5.0), "mag_time_x": 5.0 + np.arange(5.0)}
-    )
+    time = 5.0 + np.arange(5.0)
+    rows = deployment("made", time, {"mag_x": np.arange(5.0), "mag_time_x": time})
     logs.write(rows, tmp_path / "log.nc")
     read = logs.read(tmp_path / "log.nc", options=logs.Options(date=T0))
     assert read["time"].values.tolist() == (T0 + 5.0 + np.arange(5.0)).tolist()

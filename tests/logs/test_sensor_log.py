@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 from commands import Command
 from log_files import segment
+from scipy.spatial.transform import Rotation
 
 from magbridge import logs
 from magbridge.errors import FormatError, WrongUse
@@ -100,9 +101,9 @@ def test_a_sensor_that_counts_from_its_boot_needs_the_offset(both: tuple[Path, P
     log = logs.read([boot, both[1]], options=Options(clock_offset_s=START))
     other = tmp_path / "other.csv"  # of another boot, so that one offset cannot be right for both
     other.write_text(boot.read_text().replace(",1000,", ",-1000,"))
-    for read in (logs.read, lambda *args, **kwargs: list(logs.read_chunks(*args, **kwargs))):
+    for read in (logs.read, logs.read_chunks):
         with pytest.raises(FormatError, match=r"other\.csv: counts from another boot .* own --clock-offset"):
-            read([boot, other, both[1]], options=Options(clock_offset_s=START))
+            list(read([boot, other, both[1]], options=Options(clock_offset_s=START)))
     assert log["time"][0] == START + 0.5
     assert log.attrs.get("time_reference", "utc") == "utc"
 
@@ -149,10 +150,9 @@ def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Comma
     flight = sorted((real_data / "slocum_comet").glob("*.dbd"))[:3]
     glider = logs.read(flight)
     time = np.arange(float(glider["time"][0]) + 60.0, float(glider["time"][0]) + 5_400.0, 6.0)
-    angles = [np.radians(np.interp(time, glider["time"], glider[name])) for name in ("roll", "pitch")]
-    turning = np.unwrap(np.radians(glider["heading"].to_numpy()))
-    angles.append(np.interp(time, glider["time"], turning))
-    field = _in_body(np.array([17_000.0, 0.0, 47_000.0]), *angles)
+    attitude = [np.unwrap(glider[name], period=360.0) for name in ("heading", "pitch", "roll")]
+    angles = np.stack([np.interp(time, glider["time"], values) for values in attitude], axis=1)
+    field = Rotation.from_euler("ZYX", angles, degrees=True).inv().apply([17_000.0, 0.0, 47_000.0])
     moved = np.interp(time, glider["time"], glider["battpos"])
     field[:, 0] += 300.0 + 80.0 * moved
     axes = dict(zip(("mag_x", "mag_y", "mag_z"), field.T, strict=True))
@@ -162,9 +162,8 @@ def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Comma
     log = logs.read([sensor, *flight])
     assert log.sizes["time"] == len(time)
     for name in ("roll", "pitch", "heading", "latitude", "depth", "battpos"):
-        assert float(log[name].notnull().mean()) > 0.95, (
-            name
-        )  # segments of the flight log have gaps in between
+        # segments of the flight log have gaps in between
+        assert float(log[name].notnull().mean()) > 0.95, name
     calibration, corrected = tmp_path / "cal.json", tmp_path / "corrected.csv"
     files = [sensor, *flight]
     done = command("calibrate", *files, "--parameter", "battpos", "-o", calibration)
@@ -175,14 +174,3 @@ def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Comma
     done = command("info", *files, *(path.with_suffix(".ebd") for path in flight))
     assert f"{len(files)} logs together" in done.out
     assert "duplicate" not in done.err
-
-
-def _in_body(field: np.ndarray, roll: np.ndarray, pitch: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """Return a field (3,), north-east-down, in the body's axes (n, 3) at attitudes (n,), rad."""
-    north, east, down = field
-    ahead = north * np.cos(heading) + east * np.sin(heading)
-    across = -north * np.sin(heading) + east * np.cos(heading)
-    forward = ahead * np.cos(pitch) - down * np.sin(pitch)
-    below = ahead * np.sin(pitch) + down * np.cos(pitch)
-    starboard = across * np.cos(roll) + below * np.sin(roll)
-    return np.column_stack([forward, starboard, below * np.cos(roll) - across * np.sin(roll)])

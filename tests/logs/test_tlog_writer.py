@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -19,11 +20,18 @@ T0 = 1_700_000_000_000_000  # µs, a multiple of 4
 FRAME = b"\xfd" + bytes(range(40))
 
 
-def records(path: Path, size: int = 8 + len(FRAME)) -> list[tuple[int, bytes]]:
-    data = path.read_bytes()
-    return [
-        (int.from_bytes(data[k : k + 8], "big"), data[k + 8 : k + size]) for k in range(0, len(data), size)
-    ]
+def records(path: Path) -> list[tuple[int, bytes]]:
+    data, size = path.read_bytes(), 8 + len(FRAME)
+    whole = [data[k : k + size] for k in range(0, len(data), size)]
+    return [(int.from_bytes(one[:8], "big"), one[8:]) for one in whole]
+
+
+def wait(condition: Callable[[], object]) -> None:
+    """Wait until the writing thread has made a condition true, at most 5 s."""
+    deadline = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
 
 
 def test_records_carry_time_and_channel(tmp_path: Path) -> None:
@@ -40,10 +48,7 @@ def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
     with closing(TlogWriter(tmp_path)) as log:
         for k in range(3):
             log.extend([(T0 + 4 * k, 0, FRAME)])
-            deadline = time.monotonic() + 5
-            while log.records <= k:
-                assert time.monotonic() < deadline
-                time.sleep(0.001)
+            wait(lambda: log.records > k)  # noqa: B023
             time.sleep(2 * tlog.WRITE_INTERVAL_S)
         (path,) = tmp_path.iterdir()
         assert len(records(path)) == 3
@@ -52,15 +57,12 @@ def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
 def test_two_runs_in_one_folder_keep_apart(tmp_path: Path) -> None:
     """The names of the two runs differ, so that each can be replayed although both began in one second."""
     frames = FRAME, FRAME[::-1]
-    with (
-        closing(TlogWriter(tmp_path, max_size=1e-3)) as one,
-        closing(TlogWriter(tmp_path, max_size=1e-3)) as other,
-    ):
+    one, other = (TlogWriter(tmp_path, max_size=1e-3) for _ in frames)
+    with closing(one), closing(other):
         for k in range(60):
             for log, frame in zip((one, other), frames, strict=True):
                 log.extend([(T0 + 4_000_000 * k, 0, frame)])
-                while log.records <= k:
-                    time.sleep(0.001)
+                wait(lambda: log.records > k)  # noqa: B023
     files = sorted(tmp_path.iterdir())
     assert [path.name[13:] for path in files] == [f"{s}Z_000{k}.tlog" for s in (20, 21) for k in (1, 2, 3)]
     assert [frame for path in files for _, frame in records(path)] == [frames[0]] * 60 + [frames[1]] * 60
@@ -86,8 +88,7 @@ def test_directory_that_cannot_be_made_is_reported_and_tried_again(tmp_path: Pat
     directory.parent.write_text("")
     with closing(TlogWriter(directory)) as log:
         log.extend([(T0, 0, FRAME)])
-        while not log.failure:
-            time.sleep(0.001)
+        wait(lambda: log.failure)
         assert (log.lost, log.failure) == (1, "Not a directory")
         directory.parent.unlink()
         log.extend([(T0 + tlog.LOG_RETRY_US, 0, FRAME)])
@@ -138,8 +139,7 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
     def write(time_us: int) -> tuple[int, int, str]:
         before = log.records + log.lost
         log.extend([(time_us, Channel.SENT, FRAME)])
-        while log.records + log.lost == before:
-            time.sleep(0.001)
+        wait(lambda: log.records + log.lost > before)
         return log.records, log.lost, log.failure
 
     folder = tmp_path / "logs"
@@ -160,13 +160,11 @@ def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(
     with closing(TlogWriter(folder, header=[header], beginning=[begin], max_age=1e-3)) as log:
         for k in (0, 1, 2):
             log.extend([(T0 + k * 4_000_000, 0, FRAME)])
-        while log.records < 3:
-            time.sleep(0.001)
+        wait(lambda: log.records == 3)
         folder.rename(aside)
         folder.write_text("no folder")
         log.extend([(T0 + 12_000_000, 0, FRAME)])
-        while not log.failure:
-            time.sleep(0.001)
+        wait(lambda: log.failure)
         folder.unlink()
         aside.rename(folder)
         for k in (4, 5):
