@@ -50,9 +50,9 @@ class Records(dict[str, Any]):
     `at` (n,): position of each record in the file, increasing: its first byte, or its line in a text.
     """
 
-    def __init__(self, at: IndexArray, fields: Mapping[str, Any]) -> None:
+    def __init__(self, positions: IndexArray, fields: Mapping[str, Any]) -> None:
         super().__init__(fields)
-        self.at = at
+        self.at = positions
 
     def part(self, chosen: slice | BoolArray | IndexArray) -> Records:
         """Return some of the records."""
