@@ -53,8 +53,8 @@ class ConfigFault(NamedTuple):
 
 
 def warning(path: Path, key: str, text: str) -> ConfigFault:
-    """Return the fault with `text` at a dotted key of the configuration, which does not prevent a start."""
-    return ConfigFault(fatal=False, text=f"{path}: {key}: {text}")
+    """Return a fault that does not prevent a start, at a dotted key of the configuration or at none."""
+    return ConfigFault(fatal=False, text=": ".join(filter(None, (f"{path}", key, text))))
 
 
 def findings(path: Path) -> list[ConfigFault]:
@@ -80,16 +80,13 @@ def findings(path: Path) -> list[ConfigFault]:
 
 
 def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[ConfigError]:
-    """Yield the errors of `attempt`; remove the faulty key from `table` before each further attempt.
-
-    A required key is missing after its removal, which ends the attempts.
-    """
+    """Yield the errors of `attempt`; remove the faulty key from `table` before each further attempt."""
     removed = set[str]()
     while True:
         try:
             attempt()
         except ConfigError as error:
-            if error.key in removed:
+            if error.key in removed:  # it is required
                 return
             yield error
             removed.add(error.key)
@@ -165,10 +162,7 @@ def _driver(config: Config, sensor: Sensor) -> Iterator[ConfigFault]:
 
 
 def _other_sensors(config: Config, main: Calibration | None) -> Iterator[ConfigFault]:
-    """Yield the faults of the calibrations of all sensors after the first.
-
-    `main`: calibration of the first sensor, or None.
-    """
+    """Yield the faults of the calibrations of the sensors after the first, whose calibration is `main`."""
     try:
         drivers, calibrations = open_drivers(config), other_calibrations(config)
     except MagbridgeError as error:
@@ -220,10 +214,7 @@ def access(device: str) -> str:
 
 
 def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFault]:
-    """Yield a fault for each parameter that the calibration needs and the link would not provide.
-
-    Also yield the warnings of the calibration, and a calibration of another type of sensor.
-    """
+    """Yield a fault for each parameter that the link would not provide, and the calibration's warnings."""
     if not calibration.sensor.may_be(config.sensor.driver):
         text = f"the calibration is of {calibration.sensor.name!r}: every sample would be uncalibrated"
         yield warning(config.path, "sensor.driver", text)
@@ -490,8 +481,7 @@ class LiveCheck:
         return f"{text}, got {got}" if got else text
 
     def _warn(self, key: str, text: str) -> None:
-        place = f"{self._config.path}: {key}" if key else f"{self._config.path}"
-        self.faults.append(ConfigFault(fatal=False, text=f"{place}: {text}"))
+        self.faults.append(warning(self._config.path, key, text))
 
 
 def _too_rare(arrived: Arrived, denied: str, *, is_autopilot: bool) -> str:

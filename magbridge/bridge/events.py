@@ -536,11 +536,9 @@ class LiveEdge:
             return b""
 
     def _waiting(self, number: int, fd: int, held: bool) -> bytes:
-        """Return the waiting bytes of a port.
-
-        After a stall (`held`), return up to `BACKLOG` bytes of the link, because readings need the telemetry.
-        """
+        """Return the waiting bytes of a port; after a stall (`held`), up to `BACKLOG` bytes of the link."""
         data = self._read(number, fd)
+        # the readings of a stall need its telemetry
         while held and data and number == Channel.LINK and len(data) < BACKLOG:
             more = select.select([fd], [], [], 0)[0] if fd in self._ports[number].fds() else []
             piece = self._read(number, fd) if more else b""

@@ -168,10 +168,7 @@ class TcpServer(Port):
             self._dismiss(address)
 
     def _receivers(self) -> list[tuple[Any, Peer | None]]:
-        """Return descriptors and peers of the clients to send to, in the order of sending.
-
-        A client without signed frames on an unsigned link has no peer (None).
-        """
+        """Return descriptor and peer of each client to send to; None for one that only receives."""
         chosen = [(fd, peer) for fd, peer in super()._receivers() if fd in self._clients]
         answered = {fd for fd, _ in chosen}
         others = [] if self._signed else [(fd, None) for fd in self._clients if fd not in answered]
@@ -208,10 +205,7 @@ class TcpServer(Port):
         self._listener, self._fd = None, -1
 
     def _accept(self, connection: socket.socket) -> None:
-        """Accept a client; if the server is full, replace one older than `GREETING` without valid frames.
-
-        If no client can be replaced, close the new connection.
-        """
+        """Accept a client if fewer than `CONNECTIONS` exist or one can be replaced; else close it."""
         if len(self._clients) >= CONNECTIONS:
             late = time.monotonic() - GREETING
             mute = (fd for fd, one in self._clients.items() if not self._peers.is_known(fd))

@@ -426,10 +426,7 @@ class Motion:
     def _move(
         self, time_us: int, place: tuple[float, float], velocity: tuple[float, float] | None, resets: int
     ) -> None:
-        """Pass a position (north, east, m) to the navigator, without jumps from resets of its estimator.
-
-        `velocity`: velocity (north, east, m/s) with which jumps are detected; None if unknown.
-        """
+        """Pass a position (m) to the navigator without the jumps that no `velocity` (m/s) explains."""
         if self._step is not None:
             then_us, *before, count = self._step
             seconds = (time_us - then_us) * 1e-6

@@ -382,10 +382,7 @@ class NavigationService:
             self._component.output.announce("gps", text, severity)
 
     def _delay(self, message: Message, time_us: int) -> tuple[float, float]:
-        """Return how long a GPS_RAW_INT, received at `time_us` (µs), has waited, and its 1-sigma, s.
-
-        Both are 0 if unknown.
-        """
+        """Return how long a GPS_RAW_INT received at `time_us` has waited, with 1-sigma, s; 0 if unknown."""
         clock = self._component.vehicle.clock
         delay = (time_us - sent_us(self._gps_time, message.payload, time_us, clock)) * 1e-6
         return (delay, clock.sigma) if clock.known and delay < MAX_GPS_DELAY_S else (0.0, 0.0)

@@ -151,10 +151,7 @@ class Pipeline:
     def _other_streams(
         self, drivers: Sequence[Driver], calibrations: Mapping[int, Calibration], main: Calibration | None
     ) -> Iterator[SensorStream]:
-        """Yield the sensors after the first.
-
-        `calibrations`: calibrations of these sensors, by sensor id. `main`: calibration of the first sensor.
-        """
+        """Yield the sensors after the first; their `calibrations` by sensor id, `main` that of the first."""
         config, component = self._config, self.component
         for sensor, driver in zip(config.more_sensors, drivers, strict=True):
             number = sensor.id or 0
@@ -239,10 +236,8 @@ class Pipeline:
                     self._process(other, sample, corrected)
 
     def _process(self, stream: SensorStream, sample: Sample, corrected: Corrected) -> None:
-        """Check a corrected sample, pass it to navigation, heading and learning, and publish it.
-
-        During an overload, most samples are only checked and published as MAG_RAW and MAG_FIELD.
-        """
+        """Check a corrected sample, pass it to navigation, heading and learning, and publish it."""
+        # during an overload, most samples are only checked and published as MAG_RAW and MAG_FIELD
         is_brief = self._changes.is_overloaded and not stream.overload_rate.due(sample.time_us)
         if self._comparisons:
             call, compare = self._parts.call, self._compare
@@ -375,10 +370,7 @@ class Pipeline:
         self.component.output.announce("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
 
     def _begin(self, start: StartEvent, calibration: Calibration | None, *, foreign: bool) -> None:
-        """Record the frames that a replay needs, and send a STATUSTEXT about the calibration in use.
-
-        `foreign`: True if the calibration is of another type of sensor, and so is not used.
-        """
+        """Record the frames that a replay needs; report the calibration, or its `foreign` type of sensor."""
         for frame in self.beginning(start.parameters):
             self.recorder.record(start.time_us, Channel.STATE, frame)
         self._changes.check_clock()

@@ -377,10 +377,7 @@ class PacedPort(Port):
         self._begun = bytearray()
 
     def _send(self, data: bytes, address: Any) -> None:  # noqa: ARG002 - a line has one peer
-        """Send the messages in `data`, or queue them until the line accepts more bytes.
-
-        If too many messages wait, drop the older ones as a whole.
-        """
+        """Send the messages in `data`, or queue them; if too many wait, drop older ones as a whole."""
         free = not self.waiting and len(data) <= self._piece
         if free and self._room():  # the usual case, in which data need not be split into messages
             self._begun += data[self._put(data) :]

@@ -319,11 +319,9 @@ class Component:
     def _if_ours(
         self, handler: Callable[[Message], None], *, is_exact: bool = False
     ) -> Callable[[Message], None]:
-        """Return a handler that ignores messages for others; if `is_exact`, also messages for all components.
-
-        The autopilot serves files and logs too, so a broadcast request for them is not for the bridge.
-        """
+        """Return a handler that ignores messages for others; if `is_exact`, also those for all components."""
         system, component = self._link.system, self._link.component
+        # the autopilot serves files and logs too, so a broadcast request for them is not for the bridge
         systems, components = ((system,), (component,)) if is_exact else ((0, system), (0, component))
 
         def handle(message: Message) -> None:

@@ -424,10 +424,7 @@ class FtpServer:
                 return
 
     def _free(self, sender: Sender, wanted: int) -> int:
-        """Return a free session number of `sender`, preferably `wanted`; close an unused session if needed.
-
-        Refused: too many sessions are open, and each was used within `SESSION_TIMEOUT_S`.
-        """
+        """Return a free session number, preferably `wanted`, or that of an unused one; Refused: none."""
         own = [key for key in self._files if key[0] == sender]
         crowd = own if len(own) >= EACH else list(self._files) if len(self._files) >= SESSIONS else []
         if crowd:

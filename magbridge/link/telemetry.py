@@ -83,10 +83,7 @@ def can_be(field: Field, value: float) -> bool:
 
 
 def find(layout: Spec, name: str, path: Path, key: str) -> Field:
-    """Return the field `name` of a message.
-
-    ConfigError: the message has no such field; the text lists its fields.
-    """
+    """Return the field `name` of a message; ConfigError: the message has no such field."""
     try:
         return layout.fields[name]
     except KeyError:

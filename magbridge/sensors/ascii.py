@@ -252,12 +252,10 @@ class Ascii(FramedDriver):
         )
 
     def _counts_of(self, x: float, y: float, z: float, total: float) -> tuple[int, int, int] | None:
-        """Return the counts of a reading, or None without counts.
-
-        A total field (nT) is converted to counts of `SCALAR_STEP_NT`, which are more precise than a float32.
-        """
+        """Return the counts of a reading, or None without counts."""
         if self._counts:
             return int(x), int(y), int(z)
+        # counts of `SCALAR_STEP_NT` are more precise than a float32
         if self.is_scalar and abs(total) < MAX_ASCII_COUNT * SCALAR_STEP_NT:
             return round(total / SCALAR_STEP_NT), 0, 0
         return None

@@ -227,11 +227,7 @@ class Device:
 
 
 def _columns(text: bytes, channels: int, code: int) -> tuple[StreamColumn, ...]:
-    """Return the columns of a source, with names of the form ``source.column``.
-
-    `text`: name, columns, title and unit of the source, separated by tabs.
-    `channels`, `code`: number of columns, and their data type.
-    """
+    """Return the columns of a source, with names of the form ``source.column``; `code`: their data type."""
     name, listed, _, unit, *_ = [*text.decode("utf-8", "replace").split("\t"), "", "", ""]
     names = listed.split(",")
     if channels == 1 or len(names) != channels:
