@@ -289,11 +289,6 @@ MAX_CLOCK_DIFFERENCE_S = 2.0
 """Difference of the host's clock from SYSTEM_TIME above which the check reports it, s."""
 YEAR_2001_US = 10**15
 """Smallest SYSTEM_TIME that is a valid date, µs since 1970 UTC."""
-NO_READING = {
-    MAG_PORT_STATE.LOST: "the port is not open; the bridge would wait for it",
-    MAG_PORT_STATE.SILENT: "check power, cable, sensor.baudrate and sensor.options",
-    MAG_PORT_STATE.ABSENT: "check power, cable, sensor.baudrate and sensor.options",
-}
 
 
 class Arrived(NamedTuple):
@@ -436,7 +431,9 @@ class LiveCheck:
         for stream in pipeline.streams:
             self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
             if not stream.samples:
-                remedy = NO_READING[MAG_PORT_STATE(stream.state)]
+                remedy = "check power, cable, sensor.baudrate and sensor.options"
+                if stream.state == MAG_PORT_STATE.LOST:
+                    remedy = "the port is not open; the bridge would wait for it"
                 text = f"no reading in {self._duration_us * 1e-6:.0f} s: {remedy}"
                 self._warn(stream.sensor.key, f"{stream.sensor.driver}: {text}")
         heartbeat = system, self._link.autopilot, spec("HEARTBEAT").id

@@ -49,9 +49,6 @@ MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
 PX4_KEEPS_CLAIM = 1, 16
 """Last version of PX4 in which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's uncertainty. Later
 versions fuse it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
-ARDUPILOT_FUSES: tuple[int, int] | None = None
-"""First version of ArduPilot that fuses EXTERNAL_POSITION_ESTIMATE and accepts GLOBAL_POSITION_SENSOR; None,
-because no release does so yet (pull request 31738)."""
 UNANSWERED = 3
 """Number of commands in a row without a reply after which the bridge reports it."""
 HINTS = {
@@ -96,9 +93,7 @@ class Fixing:
     @property
     def velocity_stays(self) -> bool:
         """True if a fix does not change the autopilot's velocity, as ArduPilot's setLatLng."""
-        return (
-            not self._kind.fused and self._autopilot.stack != MAV_AUTOPILOT.PX4 and not self._ardupilot_fuses
-        )
+        return not self._kind.fused and self._autopilot.stack != MAV_AUTOPILOT.PX4
 
     @property
     def is_fused(self) -> bool:
@@ -106,15 +101,7 @@ class Fixing:
         version = self._autopilot.version
         replaced = version is not None and version <= PX4_KEEPS_CLAIM
         fused_by_px4 = self._autopilot.stack == MAV_AUTOPILOT.PX4 and not replaced
-        return self._kind.fused or fused_by_px4 or self._ardupilot_fuses
-
-    @property
-    def _ardupilot_fuses(self) -> bool:
-        """True if the autopilot is an ArduPilot of version :data:`ARDUPILOT_FUSES` or later."""
-        version = self._autopilot.version
-        if ARDUPILOT_FUSES is None or version is None:
-            return False
-        return self._autopilot.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and version >= ARDUPILOT_FUSES
+        return self._kind.fused or fused_by_px4
 
     def receive(self, message: Message, time_us: int) -> None:
         """Process a message of the autopilot, received at `time_us` (µs)."""
@@ -179,8 +166,7 @@ class Fixing:
 
     def _unwanted(self, now_us: int) -> str:
         """Return the reason why the autopilot does not need or accept a fix; empty if it needs a fix."""
-        accepted = self._ardupilot_fuses and not self._kind.local
-        if (stack := self._autopilot.stack) in self._kind.refused_by and not accepted:
+        if (stack := self._autopilot.stack) in self._kind.refused_by:
             return self._kind.refused_by[stack]
         if self.has_good_gps(now_us):
             return "GPS is good"

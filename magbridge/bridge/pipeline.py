@@ -49,7 +49,7 @@ NOT_USED = "calibration is not of a {}: not used"
 
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
-ATTITUDE_ID: Final = spec("ATTITUDE").id
+ATTITUDE_ID, POSITION_ID = spec("ATTITUDE").id, spec("GLOBAL_POSITION_INT").id
 HEADING_INPUTS: Final = frozenset((ATTITUDE_ID, EKF_STATUS, PX4_STATUS, spec("HEARTBEAT").id))
 """Ids of the messages that the computation of the heading uses."""
 ANNOUNCED_FLAGS = int(
@@ -317,9 +317,9 @@ class Pipeline:
                     MAV_SEVERITY.WARNING,
                 )  # fmt: skip
                 continue
-            if message.id == Position.MESSAGE and self._is_autopilot(message):
+            if message.id == POSITION_ID and self._is_autopilot(message):
                 self._parts.call("position", None, self._position.update, message, time_us)
-            elif message.id == Position.MESSAGE:
+            elif message.id == POSITION_ID:
                 text = f"position of component {message.component} ignored"
                 component.output.announce(text, text, MAV_SEVERITY.WARNING)
             elif message.id == ATTITUDE_ID and self._is_autopilot(message):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from math import atan2, cos, degrees, hypot, inf, isfinite, isnan, nan, radians, sin, tan
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -39,7 +39,6 @@ from magbridge.records import Corrected, Vector
 
 __all__ = ["CLOCK_SET_US", "LiveHeading", "Position"]
 
-POSITION = spec("GLOBAL_POSITION_INT")
 MAX_POSITION_AGE_US: Final = 60_000_000
 """Longest time for which a position is used, µs. In a minute a glider moves by 20 m, and the main field
 changes by less than 0.1 nT."""
@@ -72,8 +71,6 @@ class Position:
 
     `notify`: called with the reason if the main field is unknown at a known position.
     """
-
-    MESSAGE: ClassVar[int] = POSITION.id
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify = notify

@@ -41,11 +41,8 @@ BLOCK_BYTES: Final = 1 << 22
 MAX_RECORD_BYTES = 8 + 10 + 255 + 2 + SIGNATURE + 9
 """Length of the longest record and of the next record up to its magic byte, bytes."""
 RECORD_LAYOUT = np.dtype([("stamp", ">u8"), ("head", "u1", 10)])
-KNOWN_LENGTHS = np.full(1 << 16, -1, dtype=np.int64)
-KNOWN_LENGTHS[[number for number in EXTRA if number < len(KNOWN_LENGTHS)]] = [
-    EXTRA[number][0] for number in EXTRA if number < len(KNOWN_LENGTHS)
-]
-"""CRC_EXTRA of each message in the dialect, by message id, (65536,); -1 for other ids."""
+IN_DIALECT = np.isin(np.arange(MAX_MESSAGE_ID + 1), list(EXTRA))
+"""True for each message id in the dialect, (65536,)."""
 
 
 class TlogRecord(msgspec.Struct, frozen=True, gc=False):
@@ -203,18 +200,16 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     payload = frame + np.where(two, 10, 6)
     body_end = payload + header[:, 1]
     end = body_end + 2 + np.where(flags > 0, SIGNATURE, 0)
-    extra = np.where(
-        number < len(KNOWN_LENGTHS), KNOWN_LENGTHS[np.minimum(number, len(KNOWN_LENGTHS) - 1)], -1
-    )
+    in_dialect = IN_DIALECT[np.minimum(number, MAX_MESSAGE_ID)] & (number <= MAX_MESSAGE_ID)
     fits = (flags <= 1) & (end <= len(raw)) & (stamp < LATEST)
-    known = np.flatnonzero(fits & (extra >= 0))
+    known = np.flatnonzero(fits & in_dialect)
     spans = zip((frame[known] + 1).tolist(), body_end[known].tolist(), number[known].tolist(), strict=True)
     crc = np.array([checksum(data[first:after], EXTRA[n]) for first, after, n in spans], dtype=np.int64)
     good = np.zeros(len(start), dtype=bool)
     at = body_end[known]
     good[known] = crc == (raw[at].astype(np.int64) | raw[at + 1].astype(np.int64) << 8)
     # a record of a message outside the dialect is accepted if another record follows
-    unknown = np.flatnonzero(fits & (extra < 0) & two & (header[:, 3] == 0) & (number <= MAX_MESSAGE_ID))
+    unknown = np.flatnonzero(fits & ~in_dialect & two & (header[:, 3] == 0) & (number <= MAX_MESSAGE_ID))
     after = end[unknown] + 8
     follows = np.isin(raw[np.minimum(after, len(raw) - 1)], (V1, V2)) & (after < len(raw))
     good[unknown] = follows | (after >= len(raw))

@@ -50,7 +50,7 @@ import msgspec
 from msgspec import Meta
 
 from magbridge.records import Reading
-from magbridge.sensors.framing import CRC32_RESIDUE, FramedDriver, cobs_decode
+from magbridge.sensors.framing import CRC32_RESIDUE, FramedDriver, cobs_decode, saturated
 
 __all__ = ["EXAMPLE", "FULL_SCALE", "Digitizer", "DigitizerOptions"]
 
@@ -127,7 +127,6 @@ class Digitizer(FramedDriver):
         # a channel's upper 8 bits carry the sign
         x, y, z = x_low | x_high << 16, y_low | y_high << 16, z_low | z_high << 16
         scale, limit = self.nt_per_count, self._limit
-        saturated = not (-limit < x < limit and -limit < y < limit and -limit < z < limit)
         return Reading(
             (x * scale, y * scale, z * scale),
             (x, y, z),
@@ -142,5 +141,5 @@ class Digitizer(FramedDriver):
             nan if temperature == NO_TEMPERATURE else temperature * 0.01,
             nan if supply == NO_SUPPLY else supply * 1e-3,
             cycle,
-            flags & 7 != 0 or saturated,
+            flags & 7 != 0 or saturated(x, y, z, limit),
         )

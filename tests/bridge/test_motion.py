@@ -553,22 +553,6 @@ def test_px4_fuses_an_external_position_since_december_2025(
     assert (bench.fix(sigma=20.0)[0]["param3"] > 40.0) is widened
 
 
-@pytest.mark.parametrize(("version", "released"), [((4, 7), False), ((4, 8), True), (None, False)])
-def test_a_later_ardupilot_fuses_and_accepts_both_messages(
-    version: tuple[int, int] | None, released: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("magbridge.bridge.navigation.ARDUPILOT_FUSES", (4, 8))
-    for kind, field in (("GLOBAL_POSITION_SENSOR", "eph"), ("EXTERNAL_POSITION_ESTIMATE", "param3")):
-        bench = Bench(kind)
-        bench.receive("HEARTBEAT", autopilot=ARDUPILOT)
-        if version:
-            bench.receive("AUTOPILOT_VERSION", flight_sw_version=version[0] << 24 | version[1] << 16)
-        first = bench.fix(sigma=20.0)
-        assert bool(first) is (released or kind == "EXTERNAL_POSITION_ESTIMATE")
-        bench.to(1)
-        assert (sum(one[field] for one in bench.fix(sigma=20.0)) > 40.0) is released
-
-
 def test_an_autopilot_that_does_not_use_the_fixes_is_reported() -> None:
     """An autopilot that ignores fixes flies on 600 m away; the bridge reports this within a minute."""
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
