@@ -14,6 +14,10 @@ from magbridge.navigate import Record
 from magbridge.navigate.gnss import GnssState
 from magbridge.records import Corrected
 
+PLACE_E7 = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7)}
+ONE: dict[str, Any] = {"q": (1.0, 0.0, 0.0, 0.0), "child_frame_id": 12}
+"""Fields of an ODOMETRY in the axes of the body, without a turn."""
+
 
 def made(kind: str = "GLOBAL_POSITION_SENSOR", stack: int = PX4) -> Bench:
     """Return a bench with a known position."""
@@ -82,7 +86,7 @@ def test_gps_that_held_cleans_the_autopilots_position() -> None:
     assert bench.navigation.motion.fed_back
     for k in range(2, 70):
         bench.to(k)
-        bench.receive("GPS_RAW_INT", fix_type=3, lat=round(PLACE[0] * 1e7), lon=round(PLACE[1] * 1e7))
+        bench.receive("GPS_RAW_INT", fix_type=3, **PLACE_E7)
         assert bench.navigation.motion.fed_back == (k <= 62)
 
 
@@ -90,9 +94,7 @@ def test_the_position_of_another_component_stays() -> None:
     bench = made()
     for k in range(1, 11):
         bench.to(k)
-        bench.receive(
-            "ODOMETRY", component=197, x=2.0 * k, q=(1.0, 0.0, 0.0, 0.0), frame_id=1, child_frame_id=12
-        )
+        bench.receive("ODOMETRY", component=197, x=2.0 * k, **ONE)
         bench.receive("LOCAL_POSITION_NED", x=500.0 * k, vx=500.0)
         bench.fix()
     assert source(bench) is MotionSource.OTHER
@@ -103,7 +105,7 @@ def test_two_streams_are_not_mixed() -> None:
     bench = made()
     for k in range(1, 6):
         local(bench, k, float(k))
-        bench.receive("ODOMETRY", x=1000.0 + k, q=(1.0, 0.0, 0.0, 0.0), child_frame_id=12, vx=1.0)
+        bench.receive("ODOMETRY", x=1000.0 + k, vx=1.0, **ONE)
     assert moved(bench)[0] == pytest.approx(4.0, abs=0.1)
 
 
@@ -115,7 +117,7 @@ def test_a_jump_is_not_a_motion(counted: bool) -> None:
         bench.to(k)
         x = 2.0 * k + 300.0 * (k > 5)
         fields: dict[str, Any] = {"vx": 0.0 if counted else 2.0, "reset_counter": int(counted and k > 5)}
-        bench.receive("ODOMETRY", x=x, q=(1.0, 0.0, 0.0, 0.0), child_frame_id=12, **fields)
+        bench.receive("ODOMETRY", x=x, **ONE, **fields)
     assert moved(bench)[0] == pytest.approx(16.0 if counted else 18.0, abs=0.1)
 
 
@@ -262,6 +264,19 @@ def sample(bench: Bench, latitude: float, longitude: float) -> None:
     bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))
 
 
+def aircraft(bench: Bench, yaw: float, airspeed: float, groundspeed: float, **state: int) -> None:
+    """Deliver what an aircraft sends of itself, and its landed state if it is given."""
+    bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=state.get("base_mode", 128))
+    if "landed_state" in state:
+        bench.receive("EXTENDED_SYS_STATE", landed_state=state["landed_state"])
+    bench.receive("ATTITUDE", yaw=yaw)
+    bench.receive("VFR_HUD", airspeed=airspeed, groundspeed=groundspeed)
+
+
+def is_good(bench: Bench) -> bool:
+    return bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD)
+
+
 @pytest.mark.parametrize("reports", [True, False])
 def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool) -> None:
     """An aircraft measures 6 m/s of wind, rolls for 10 s, and flies in a cross wind from then on.
@@ -273,18 +288,15 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
     for k in range(1, 181 if reports else 301):
         flying, speed = k > 70, 22.0 * min(max(k - 60, 0) / 10.0, 1.0)
         bench.to(k)
-        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128 * (k > 50))
-        if reports:
-            bench.receive("EXTENDED_SYS_STATE", landed_state=2 if flying else 1)
-        bench.receive("ATTITUDE", yaw=np.pi / 2)
-        bench.receive("VFR_HUD", airspeed=speed or 6.0, groundspeed=speed + 0.1)
+        state = {"base_mode": 128 * (k > 50)} | ({"landed_state": 1 + flying} if reports else {})
+        aircraft(bench, np.pi / 2, speed or 6.0, speed + 0.1, **state)
         north, east = north + 5.0 * flying, east + speed
         latitude, longitude = offset(*PLACE, north, east)
         place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
         bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
         sample(bench, latitude, longitude)
         if reports or k > 270:
-            assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
+            assert is_good(bench), k
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
 
 
@@ -301,36 +313,29 @@ def test_wind_that_grows_with_height_does_not_reject_gps_in_the_climb(seed: int)
         moved += wind * height / 100.0
         position = position + 0.5 * moved
         bench.to(0.5 * k)
-        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128)
-        bench.receive("EXTENDED_SYS_STATE", landed_state=2 if flying else 1)
-        bench.receive("ATTITUDE", yaw=along)
-        bench.receive("VFR_HUD", airspeed=speed, groundspeed=np.hypot(*moved) + 0.1)
+        aircraft(bench, along, speed, np.hypot(*moved) + 0.1, landed_state=1 + flying)
         latitude, longitude = offset(*PLACE, *(position + rng.normal(0.0, 0.5, 2)).tolist())
         place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(1e3 * height)}
         bench.receive("GLOBAL_POSITION_INT", **place)
         bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
         sample(bench, latitude, longitude)
-        assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
+        assert is_good(bench), k
 
 
 def test_the_first_height_of_an_airfield_does_not_reject_gps() -> None:
     """On an airfield at 1,500 m, GPS is good 5 s before the autopilot's origin: 38 nT of the main field."""
     bench = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT)
-    place = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7)}
     rng, anomaly = np.random.default_rng(1), hills().look_up(PLACE[1], PLACE[0], 0.0).anomaly
     for k in range(1, 301):
         bench.to(0.2 * k)
-        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=0)
-        bench.receive("EXTENDED_SYS_STATE", landed_state=1)
-        bench.receive("ATTITUDE", yaw=0.0)
-        bench.receive("VFR_HUD", airspeed=0.3, groundspeed=0.05)
+        aircraft(bench, 0.0, 0.3, 0.05, base_mode=0, landed_state=1)
         if k % 5 == 0:
-            bench.receive("GLOBAL_POSITION_INT", **(place | {"alt": 1_500_000} if k > 50 else {}))
+            bench.receive("GLOBAL_POSITION_INT", **(PLACE_E7 | {"alt": 1_500_000} if k > 50 else {}))
         if k > 25 and k % 5 == 0:
-            bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, alt=1_500_000, **place)
+            bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, alt=1_500_000, **PLACE_E7)
         field = total_field(PLACE[1], PLACE[0], -1500.0, bench.now_us * 1e-6).item() + anomaly + rng.normal()
         bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))
-        assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
+        assert is_good(bench), k
 
 
 def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:
@@ -345,7 +350,7 @@ def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:
         return use(time_us, latitude, longitude, sigma)
 
     navigator.gnss_position = record  # type: ignore[method-assign]
-    where = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7), "h_acc": 1000, "fix_type": 3}
+    where = PLACE_E7 | {"h_acc": 1000, "fix_type": 3}
     bench.receive("GPS_RAW_INT", vel=4000, cog=9000, **where)
     bench.receive("GPS_RAW_INT", vel=65535, cog=65535, **where)
     moved_on, as_measured = seen
@@ -368,12 +373,10 @@ def test_an_autopilot_that_contradicts_its_sensors_has_an_uncertain_heading(name
     sigma = {}
     for ratio in (0.1, 5.0):
         bench = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT)
-        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128)
         bench.navigation.navigator.fix(bench.now_us, *PLACE, 5.0)
         for k in range(1, 32):
             bench.to(k)
-            bench.receive("ATTITUDE", yaw=np.pi / 2)
-            bench.receive("VFR_HUD", airspeed=20.0, groundspeed=24.0)
+            aircraft(bench, np.pi / 2, 20.0, 24.0)
             status: dict[str, Any] = {"flags": 831, field: ratio}
             bench.receive(name, **status)
             sample(bench, *offset(*PLACE, 0.0, 20.0 * k))
@@ -556,14 +559,14 @@ def test_px4_fuses_an_external_position_since_december_2025(
 def test_an_autopilot_that_does_not_use_the_fixes_is_reported() -> None:
     """An autopilot that ignores fixes flies on 600 m away; the bridge reports this within a minute."""
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
-    there = {"lat": round(PLACE[0] * 1e7) + 54_000, "lon": round(PLACE[1] * 1e7)}
+    there = PLACE_E7 | {"lat": PLACE_E7["lat"] + 54_000}
     for k in range(60):
         bench.to(k)
         bench.fix()
         bench.receive("COMMAND_ACK", **ACK, result=0)
         bench.receive("GLOBAL_POSITION_INT", **there)
     assert bench.texts_with("not use") == ["the autopilot does not use the fixes: its position is 601 m off"]
-    near = {**there, "lat": round(PLACE[0] * 1e7) + 100}
+    near = PLACE_E7 | {"lat": PLACE_E7["lat"] + 100}
     for k in range(60, 130):
         bench.to(k)
         bench.fix()

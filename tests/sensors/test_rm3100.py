@@ -19,14 +19,14 @@ from sitl.fluxgate import results
 class Rm3100Registers:
     """Emulated register map of an RM3100 in a `field` (nT) at its coils.
 
-    If it `is_frozen`, no measurement completes until the registers are written again. If it `has_failed`, the
-    bus does not answer; if it `is_absent`, an SPI bus reads zeros. `broken_axes` (bits 4 to 6) are the coils
-    that fail the self-test.
+    If it `is_frozen`, no measurement completes until the registers are written again; if it `is_dead`, none
+    completes at all. If it `has_failed`, the bus does not answer; if it `is_absent`, an SPI bus reads zeros.
+    `broken_axes` (bits 4 to 6) are the coils that fail the self-test.
     """
 
     def __init__(self) -> None:
         self.field = (20_000.0, -1_000.0, 45_000.0)
-        self.is_frozen = self.has_failed = self.is_absent = False
+        self.is_frozen = self.is_dead = self.has_failed = self.is_absent = False
         self.broken_axes = 0
         self.configured = 0
         self._registers = bytearray(0x37)
@@ -40,7 +40,8 @@ class Rm3100Registers:
             return bytes(count)
         if register == rm3100.STATUS:
             is_measuring = self._registers[rm3100.CMM] & 1 or self._ready
-            self._registers[rm3100.STATUS] = 0x80 if is_measuring and not self.is_frozen else 0
+            is_stuck = self.is_frozen or self.is_dead
+            self._registers[rm3100.STATUS] = 0x80 if is_measuring and not is_stuck else 0
         if register == rm3100.RESULTS:
             cycles = int.from_bytes(self._registers[4:6], "big")
             step = Rm3100Options(cycle_count=cycles).nt_per_count
@@ -101,30 +102,19 @@ def test_a_wait_without_data_gives_no_reading() -> None:
     assert part.poll(bus, 0.1) == b""
 
 
-def test_a_part_that_measures_nothing_fails_the_self_test() -> None:
-    class Dead(Rm3100Registers):
-        def write(self, register: int, data: bytes) -> None:
-            super().write(register, data)
-            self.is_frozen = True
-
-    with pytest.raises(OSError, match="self-test: no measurement completes"):
-        driver().configure(Dead())
-
-
-def test_a_coil_that_fails_the_self_test_is_named() -> None:
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        ({"is_dead": True}, "self-test: no measurement completes"),
+        ({"broken_axes": 0x20}, "self-test failed: y"),
+        ({"is_absent": True}, "no RM3100 answers: expected 0x22"),
+    ],
+)
+def test_a_part_with_a_fault_is_not_started(fault: dict[str, int], text: str) -> None:
     bus = Rm3100Registers()
-    bus.broken_axes = 0x20
-    with pytest.raises(OSError, match="self-test failed: y"):
+    vars(bus).update(fault)
+    with pytest.raises(OSError, match=text):
         driver().configure(bus)
-    driver(self_test=False).configure(bus)
-
-
-def test_zeros_of_an_empty_bus_are_not_a_field() -> None:
-    bus, part = Rm3100Registers(), driver()
-    part.configure(bus)
-    bus.is_absent = True
-    with pytest.raises(OSError, match="no RM3100 answers: expected 0x22"):
-        part.poll(bus, 0.0)
 
 
 def test_a_rate_that_the_cycle_count_does_not_allow_is_refused() -> None:
