@@ -1,16 +1,15 @@
 """Test that commands are acknowledged to their sender."""
 
-from collections.abc import Mapping
 from math import inf, nan
 from typing import Any
 
 import pytest
-from line import Line
+from line import Line, MakeLine
 
 from magbridge.config import Telemetry
 from magbridge.link.output import Output
-from magbridge.link.telemetry import Stream, StreamRequests, TelemetryMap, needed_rates
-from magbridge.mavlink import Codec, Message, spec
+from magbridge.link.telemetry import TelemetryMap, needed_rates
+from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
@@ -115,7 +114,6 @@ def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Lin
 # ---- The bridge requests the messages that it needs, and never lowers a rate -----------------------------
 
 
-SECOND = 1_000_000
 ATTITUDE, VFR_HUD = (1, spec("ATTITUDE").id), (1, spec("VFR_HUD").id)
 NEEDED = {ATTITUDE: (10.0, 4.0), VFR_HUD: (5.0, 2.0)}
 
@@ -123,57 +121,33 @@ NEEDED = {ATTITUDE: (10.0, 4.0), VFR_HUD: (5.0, 2.0)}
 class Bench:
     """Autopilot that sends messages at given rates, and replies to each request with one result."""
 
-    def __init__(
-        self,
-        kind: int,
-        result: int = MAV_RESULT.ACCEPTED,
-        needed: Mapping[Stream, tuple[float, float]] = NEEDED,
-    ) -> None:
-        self.codec = Codec(1, 191)
-        self.output = Output(self.codec)
-        self.requests = StreamRequests((1, 1), needed, self.output)
-        self._ear, self._kind, self._result = Codec(0, 0), kind, result
-        self._codecs = {1: Codec(1, 1), 25: Codec(1, 25)}
+    def __init__(self, link: Line, kind: int, result: int = ACCEPTED) -> None:
+        self.link, self.requests = link, link.component.streams
+        self._kind, self._result, self._seconds = kind, result, 0
         self.receivers: set[int] = set()
         self.asked: list[tuple[str, float]] = []
-        self.now_us = 0
 
     def run(self, seconds: int, component: int = 1, **rates: int) -> None:
+        codec = Codec(1, component)
         for _ in range(seconds):
-            self._give("HEARTBEAT", type=self._kind)
-            for name, rate in rates.items():
-                for _ in range(rate):
-                    self._give(name, component)
-            self.now_us += SECOND
-            self.output.advance(self.now_us)
-            self._answer()
+            self.link.fly("HEARTBEAT", type=self._kind)
+            self.link.give(b"".join(codec.pack(name) for name, rate in rates.items() for _ in range(rate)))
+            self._seconds += 1
+            self._answer(self.link.to(self._seconds))
 
-    def _give(self, name: str, component: int = 1, **fields: object) -> None:
-        (message,) = self._ear.parse(self._codecs[component].pack(name, **fields))
-        self.requests.receive(message, self.now_us)
-
-    def _answer(self) -> None:
-        while frames := self.output.drain():
-            for _, frame in frames:
-                (message,) = Codec(0, 0).parse(frame)
-                if message.name == "COMMAND_LONG":
-                    self._keep(message)
-
-    def _keep(self, message: Message) -> None:
-        assert message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL
-        assert message["target_system"] == 1
-        self.receivers.add(message["target_component"])
-        self.asked.append((spec(int(message["param1"])).name, 1e6 / message["param2"]))
-        self._give(
-            "COMMAND_ACK",
-            message["target_component"],
-            command=MAV_CMD.SET_MESSAGE_INTERVAL,
-            result=self._result,
-        )
+    def _answer(self, received: list[Any]) -> None:
+        for request in self.link.only(received, "COMMAND_LONG"):
+            assert (request.command, request.target_system) == (SET, 1)
+            self.receivers.add(request.target_component)
+            self.asked.append((spec(int(request.param1)).name, 1e6 / request.param2))
+            sender = Codec(1, request.target_component)
+            self._answer(self.link.give(sender.pack("COMMAND_ACK", command=SET, result=self._result)))
 
 
-def test_messages_that_arrive_too_rarely_are_requested_at_the_rates_of_the_vehicle() -> None:
-    plane, glider = Bench(1), Bench(int(MAV_TYPE.SUBMARINE))
+def test_messages_that_arrive_too_rarely_are_requested_at_the_rates_of_the_vehicle(
+    make_link: MakeLine,
+) -> None:
+    plane, glider = (Bench(make_link(streams=NEEDED), kind) for kind in (1, MAV_TYPE.SUBMARINE))
     for bench in (plane, glider):
         bench.run(12, ATTITUDE=1, VFR_HUD=1)
     assert plane.asked == [("ATTITUDE", 10.0), ("VFR_HUD", 5.0)]
@@ -181,15 +155,15 @@ def test_messages_that_arrive_too_rarely_are_requested_at_the_rates_of_the_vehic
     assert plane.receivers == {1}
 
 
-def test_a_rate_that_is_high_enough_stays_as_another_client_has_set_it() -> None:
-    bench = Bench(1)
+def test_a_rate_that_is_high_enough_stays_as_another_client_has_set_it(make_link: MakeLine) -> None:
+    bench = Bench(make_link(streams=NEEDED), 1)
     bench.run(60, ATTITUDE=50, VFR_HUD=4)
     assert bench.asked == []
     assert bench.requests.measured["ATTITUDE"] == 50.0
 
 
-def test_a_request_is_repeated_a_few_times_and_again_after_a_reboot() -> None:
-    bench = Bench(1)
+def test_a_request_is_repeated_a_few_times_and_again_after_a_reboot(make_link: MakeLine) -> None:
+    bench = Bench(make_link(streams=NEEDED), 1)
     bench.run(120, ATTITUDE=1, VFR_HUD=5)
     assert bench.asked == [("ATTITUDE", 10.0)] * 3
     bench.requests.rebooted()
@@ -197,19 +171,18 @@ def test_a_request_is_repeated_a_few_times_and_again_after_a_reboot() -> None:
     assert len(bench.asked) == 4
 
 
-def test_a_denial_is_reported_and_not_repeated() -> None:
-    bench = Bench(1, MAV_RESULT.DENIED)
+def test_a_denial_is_reported_and_not_repeated(make_link: MakeLine) -> None:
+    bench = Bench(make_link(streams=NEEDED), 1, DENIED)
     bench.run(60, ATTITUDE=1, VFR_HUD=5)
     assert bench.asked == [("ATTITUDE", 10.0)]
-    assert [text for _, text in bench.output.texts] == [
-        "the autopilot does not send ATTITUDE at 10 Hz: DENIED"
-    ]
+    told = [text for _, text in bench.link.component.output.texts if "does not send" in text]
+    assert told == ["the autopilot does not send ATTITUDE at 10 Hz: DENIED"]
 
 
-def test_telemetry_is_requested_from_the_component_that_is_its_source() -> None:
+def test_telemetry_is_requested_from_the_component_that_is_its_source(make_link: MakeLine) -> None:
     battery = Telemetry("BATTERY_STATUS", "current_battery", component=25)
     needed = needed_rates(1, [battery], attitude=False, navigation=False)
-    bench = Bench(1, MAV_RESULT.UNSUPPORTED, needed)
+    bench = Bench(make_link(streams=needed), 1, UNSUPPORTED)
     bench.run(12, 1, GLOBAL_POSITION_INT=5, BATTERY_STATUS=5)
     assert bench.asked == [("BATTERY_STATUS", 5.0)]
     assert bench.receivers == {25}
@@ -218,9 +191,12 @@ def test_telemetry_is_requested_from_the_component_that_is_its_source() -> None:
     }
 
 
-def test_telemetry_that_another_component_sends_is_not_requested_from_the_autopilot() -> None:
+def test_telemetry_that_another_component_sends_is_not_requested_from_the_autopilot(
+    make_link: MakeLine,
+) -> None:
     needed = needed_rates(1, [Telemetry("RPM", "rpm1")], attitude=False, navigation=False)
-    bench = Bench(1, needed={stream: pair for stream, pair in needed.items() if stream[1] == spec("RPM").id})
+    rpm = {stream: pair for stream, pair in needed.items() if stream[1] == spec("RPM").id}
+    bench = Bench(make_link(streams=rpm), 1)
     bench.run(30, 25, RPM=5)
     assert bench.asked == []
     assert bench.requests.measured == {"RPM": 5.0}

@@ -3,7 +3,6 @@
 import random
 from collections.abc import Iterable
 from math import isfinite, isnan, nan
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -139,29 +138,12 @@ def test_timers_fire_in_order_at_their_own_times() -> None:
     assert output.next_deadline == FOREVER
 
 
-class Talker:
-    def __init__(self, peer: ModuleType) -> None:
-        self.codec = Codec(1, 191)
-        self.output = Output(self.codec)
-        self.station = peer.MAVLink(None)
-        self.codec.now_us = START
-
-    def at(self, seconds: float) -> list[Any]:
-        self.output.advance(START + round(seconds * 1e6))
-        return [m for _, frame in self.output.drain() for m in self.station.parse_buffer(frame)]
-
-
-@pytest.fixture
-def talker(peer: ModuleType) -> Talker:
-    return Talker(peer)
-
-
 @pytest.mark.parametrize("length", [12, 50, 51, 99, 100, 150, 151])
-def test_a_text_is_sent_whole_or_in_pieces(talker: Talker, length: int) -> None:
+def test_a_text_is_sent_whole_or_in_pieces(link: Line, length: int) -> None:
     text = "".join(chr(97 + i % 26) for i in range(length))
     for _ in range(2):
-        talker.output.send_statustext(text)
-        messages = talker.at(0)
+        link.component.output.send_statustext(text)
+        messages = link.receive()
         assert "".join(message.text for message in messages) == text
         assert {message.severity for message in messages} == {6}
         if length <= 50:
@@ -171,18 +153,18 @@ def test_a_text_is_sent_whole_or_in_pieces(talker: Talker, length: int) -> None:
             assert messages[0].id > 0
             assert [message.chunk_seq for message in messages] == list(range(len(messages)))
             assert len(messages[-1].text) < 50  # else the receiver waits for more
-    talker.output.send_statustext("5 µT")
-    assert talker.at(0)[0].text == "5 ?T"
+    link.component.output.send_statustext("5 µT")
+    assert link.receive()[0].text == "5 ?T"
 
 
-def test_a_flapping_text_is_sent_once_a_second_and_its_last_state_always(talker: Talker) -> None:
+def test_a_flapping_text_is_sent_once_a_second_and_its_last_state_always(link: Line) -> None:
     texts = []
     for i in range(201):  # 100 Hz for 2 s, ends on "up"
-        texts += talker.at(i / 100)
-        talker.output.announce("link", "up" if i % 2 == 0 else "down")
-    texts += talker.at(10)
+        texts += link.texts(link.to(1 + i / 100))
+        link.component.output.announce("link", "up" if i % 2 == 0 else "down")
+    texts += link.texts(link.to(10))
     assert 2 <= len(texts) <= 4
-    assert texts[-1].text == "up"
+    assert texts[-1] == "up"
 
 
 # ---- Each decoded fix is the original position, in the frame and units of its message ----------------------
