@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from checks import NOISE, Measured, replays, soon
-from devices import TELEMETRY_HZ, TRUTH, udp_socket
+from devices import TELEMETRY_HZ, TRUTH, Ear
 from rig import OPTIONS, Rig, calibration
 
 from magbridge.calibration.file import save
@@ -223,30 +223,17 @@ def test_garbage_from_the_sensor(rig: Rig, measured: Measured) -> None:
 def test_second_bridge_on_the_same_sensor(rig: Rig) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
-    with udp_socket(0.0) as sink:
-        second = rig.folder / "second"
-        second.mkdir()
-        config = second / "bridge.toml"
-        text = rig.settings(f"udpout:127.0.0.1:{sink.getsockname()[1]}").replace(
-            '"cal.json"', '"../cal.json"'
-        )
-        config.write_text(text)
-        ear, texts = Codec(0, 0), list[str]()
-
-        def refused() -> bool:
-            try:
-                received = ear.parse(sink.recv(65536))
-                texts.extend(message["text"] for message in received if message.name == "STATUSTEXT")
-            except BlockingIOError:
-                pass
-            return any("digitizer lost" in text for text in texts)
-
-        other = rig.spawn(config)
-        try:
-            rig.until(refused)
-        finally:
-            other.terminate()
-            rig.until(lambda: other.poll() is not None)
+    ear, second = Ear(255), rig.folder / "second"
+    second.mkdir()
+    text = rig.settings(f"udpout:127.0.0.1:{ear.line.getsockname()[1]}")
+    (second / "bridge.toml").write_text(text.replace('"cal.json"', '"../cal.json"'))
+    other = rig.spawn(second / "bridge.toml")
+    try:
+        rig.until(lambda: any("digitizer lost" in one["text"] for one in ear.of("STATUSTEXT")))
+    finally:
+        other.terminate()
+        rig.until(lambda: other.poll() is not None)
+        ear.line.close()
     assert other.returncode == 0
     after = rig.fresh_status()
     assert after["samples_lost"] == before["samples_lost"]

@@ -96,35 +96,31 @@ def test_the_messages_own_time() -> None:
     assert one[2] == NOW  # UNIX time, of another clock
 
 
+NAMED, SERVO = ("NAMED_VALUE_FLOAT", "value"), ("SERVO_OUTPUT_RAW", "servo1_raw")
+
+
 @pytest.mark.parametrize(
-    ("what", "complaint"),
+    ("source", "match", "complaint"),
     [
-        (Telemetry("NO_SUCH", "x"), r"b.toml: telemetry.p.message: unknown MAVLink message 'NO_SUCH'"),
-        (Telemetry("ATTITUDE", "rol"), r"telemetry.p.field: ATTITUDE has no field 'rol'; did you mean roll?"),
-        (Telemetry("ATTITUDE", "roll[0]"), r"telemetry.p.field: roll without an index, not 'roll\[0\]'"),
-        (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator"), r"actuator\[0\] to actuator\[31\], not 'actuator'"),
-        (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[32]"), r"actuator\[0\] to actuator\[31\]"),
-        (Telemetry("ATTITUDE", "roll-pitch"), r"has no field 'roll-pitch'"),
-        (Telemetry("STATUSTEXT", "text"), r"a number, but STATUSTEXT.text is text"),
-        (
-            Telemetry("NAMED_VALUE_FLOAT", "value", match={"nam": "a"}),
-            r"telemetry.p.match.nam: .* no field 'nam'",
-        ),
-        (Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": 3}), r"telemetry.p.match.name: text, not 3"),
-        (
-            Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "battery_position"}),
-            r"telemetry.p.match.name: at most 10 bytes, not 'battery_position'",
-        ),
-        (
-            Telemetry("SERVO_OUTPUT_RAW", "servo1_raw", match={"port": 300}),
-            r"telemetry.p.match.port: a value that SERVO_OUTPUT_RAW.port can have, not 300",
-        ),
-        (Telemetry("BATTERY_STATUS", "id", match={"id": "a"}), r"telemetry.p.match.id: a number, not 'a'"),
+        (("NO_SUCH", "x"), {}, r"b.toml: telemetry.p.message: unknown MAVLink message 'NO_SUCH'"),
+        (("ATTITUDE", "rol"), {}, r"p.field: ATTITUDE has no field 'rol'; did you mean roll?"),
+        (("ATTITUDE", "roll[0]"), {}, r"telemetry.p.field: roll without an index, not 'roll\[0\]'"),
+        (("ACTUATOR_OUTPUT_STATUS", "actuator"), {}, r"actuator\[0\] to actuator\[31\], not 'actuator'"),
+        (("ACTUATOR_OUTPUT_STATUS", "actuator[32]"), {}, r"actuator\[0\] to actuator\[31\]"),
+        (("ATTITUDE", "roll-pitch"), {}, r"has no field 'roll-pitch'"),
+        (("STATUSTEXT", "text"), {}, r"a number, but STATUSTEXT.text is text"),
+        (NAMED, {"nam": "a"}, r"telemetry.p.match.nam: .* no field 'nam'"),
+        (NAMED, {"name": 3}, r"telemetry.p.match.name: text, not 3"),
+        (NAMED, {"name": "battery_position"}, r"p.match.name: at most 10 bytes, not 'battery_position'"),
+        (SERVO, {"port": 300}, r"p.match.port: a value that SERVO_OUTPUT_RAW.port can have, not 300"),
+        (("BATTERY_STATUS", "id"), {"id": "a"}, r"telemetry.p.match.id: a number, not 'a'"),
     ],
 )
-def test_mistakes_are_one_clear_line(what: Telemetry, complaint: str) -> None:
+def test_mistakes_are_one_clear_line(
+    source: tuple[str, str], match: dict[str, str | float], complaint: str
+) -> None:
     with pytest.raises(ConfigError, match=complaint):
-        TelemetryMap({"p": what}, path=Path("b.toml"))
+        TelemetryMap({"p": Telemetry(*source, match=match)}, path=Path("b.toml"))
 
 
 def test_every_numeric_field_of_every_message_maps() -> None:
