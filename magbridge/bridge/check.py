@@ -424,9 +424,8 @@ class LiveCheck:
         latest = {text.partition(": ")[0]: text for _, text in said}
         texts = [text for severity, text in said if severity <= MAV_SEVERITY.WARNING]
         texts = [text for text in texts if latest[text.partition(": ")[0]] == text]
-        denied = streams.denied.values()
         for text in dict.fromkeys(texts):
-            if text not in denied:
+            if text not in streams.denied.values():
                 self._warn("", text)
         for stream in pipeline.streams:
             self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
@@ -445,9 +444,8 @@ class LiveCheck:
             # another component may send a message that the autopilot is expected to send
             rate_hz = max(one.rate_hz, streams.measured.get(one.name, 0.0)) if is_autopilot else one.rate_hz
             if rate_hz < MIN_RATE_FRACTION * one.needed_hz:
-                self._warn(
-                    "link", _too_rare(one, streams.denied.get(one.name, ""), is_autopilot=is_autopilot)
-                )
+                denied = streams.denied.get(one.name, "")
+                self._warn("link", _too_rare(one, denied, is_autopilot=is_autopilot))
         for name in self._config.telemetry:
             if not self._values[name]:
                 self._warn(f"telemetry.{name}", self._no_value(name))

@@ -37,15 +37,11 @@ UNSET = (0, 0)
 """Latitude and longitude in GPS_GLOBAL_ORIGIN of an autopilot without an origin."""
 LONGEST_US = 60_000_000
 """Time after which a report of the autopilot no longer counts, µs."""
-ATTITUDE, GLOBAL_POSITION, GPS_RAW = (
-    spec(name).id for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT")
-)
-HEARTBEAT, LOCAL_POSITION, ODOMETRY = (
-    spec(name).id for name in ("HEARTBEAT", "LOCAL_POSITION_NED", "ODOMETRY")
-)
-ORIGIN, SYS_STATUS, SYSTEM_STATE, VERSION = (
-    spec(name).id for name in ("GPS_GLOBAL_ORIGIN", "SYS_STATUS", "EXTENDED_SYS_STATE", "AUTOPILOT_VERSION")
-)
+ATTITUDE, HEARTBEAT, ODOMETRY = (spec(name).id for name in ("ATTITUDE", "HEARTBEAT", "ODOMETRY"))
+GLOBAL_POSITION, LOCAL_POSITION = spec("GLOBAL_POSITION_INT").id, spec("LOCAL_POSITION_NED").id
+GPS_RAW, ORIGIN = spec("GPS_RAW_INT").id, spec("GPS_GLOBAL_ORIGIN").id
+SYS_STATUS, SYSTEM_STATE = spec("SYS_STATUS").id, spec("EXTENDED_SYS_STATE").id
+VERSION = spec("AUTOPILOT_VERSION").id
 FIX_3D = 3
 """Smallest GPS_RAW_INT.fix_type whose position is used."""
 ARMED = 128
@@ -349,13 +345,8 @@ class Motion:
         if not self._autopilot.measures_airspeed:
             return
         speed = message["airspeed"]  # 0 of a vehicle that does not measure it
-        is_ground = (
-            min(
-                abs(speed - message["groundspeed"]),
-                abs(speed - self._autopilot.value(GPS_RAW, "vel", nan) * 1e-2),
-            )
-            < EQUAL_M_S
-        )
+        ground_speeds = message["groundspeed"], self._autopilot.value(GPS_RAW, "vel", nan) * 1e-2
+        is_ground = any(abs(speed - one) < EQUAL_M_S for one in ground_speeds)
         if is_ground and speed > 0.0:
             text = "VFR_HUD.airspeed is the speed over ground: not used"
             self._equal += 1

@@ -144,9 +144,9 @@ class Fixing:
         unwanted = self._unwanted(now_us)
         if unwanted or reckoned is None:
             return unwanted or "no valid position"
-        pose = (
-            self._autopilot.pose(now_us, reckoned.latitude, reckoned.longitude) if self._kind.local else None
-        )
+        pose = None
+        if self._kind.local:
+            pose = self._autopilot.pose(now_us, reckoned.latitude, reckoned.longitude)
         if isinstance(pose, str):
             return pose
         fix = Fix(
@@ -427,10 +427,9 @@ def open_navigation(
     kind = FIX_MESSAGES[wanted.fix]
     if wanted.rate is not None:
         if wanted.rate < kind.least:
-            expected = (
-                f"expected at least {kind.least:g} Hz, or nothing: the autopilot drops slower {wanted.fix}"
-            )
-            raise ConfigError(config.path, "navigation.rate", f"{expected}, not {wanted.rate:g}")
+            expected = f"expected at least {kind.least:g} Hz, or nothing, not {wanted.rate:g}"
+            why = f"the autopilot drops slower {wanted.fix}"
+            raise ConfigError(config.path, "navigation.rate", f"{expected}: {why}")
         kind = kind._replace(rate=wanted.rate)
     dives = np.linspace(0.0, wanted.depth)
     return partial(NavigationService, *at_depth(read_grid(config.resolve(wanted.map)), options, dives), kind)

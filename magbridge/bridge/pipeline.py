@@ -107,9 +107,8 @@ class Pipeline:
         if len(self.streams) > 1:
             self.component.more_reports += [one.report for one in self.streams]
         self._changes = StateChanges(self.component.output, self._by_id)
-        self._comparisons = [
-            SensorComparison((config.sensor.label, one.label)) for one in config.more_sensors
-        ]
+        main_label = config.sensor.label
+        self._comparisons = [SensorComparison((main_label, one.label)) for one in config.more_sensors]
         self.recorder = Recorder(own.system, own.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
         self.learning = LearningService(learner, self.component) if learner is not None else None

@@ -148,9 +148,8 @@ class Peers:
         valid.sort(key=lambda peer: (now - peer.autopilot_s > PEER_SILENCE_S, peer.first_valid_s))
         self._receivers = valid[:MAX_RECEIVERS]
         autopilots = sum(now - peer.autopilot_s < PEER_SILENCE_S for peer in valid)
-        self._notify(
-            f"more than {MAX_RECEIVERS} peers: the others are not answered", len(valid) > MAX_RECEIVERS
-        )
+        text = f"more than {MAX_RECEIVERS} peers: the others are not answered"
+        self._notify(text, len(valid) > MAX_RECEIVERS)
         self._notify("the autopilot sends from several addresses", autopilots > 1)
         return self._receivers
 
@@ -162,10 +161,8 @@ class Peers:
         now = time.monotonic()
         if self._budget == inf or (peer is not None and now - peer.autopilot_s < PEER_SILENCE_S):
             return True
-        self._allowance = min(
-            self._allowance + (now - self._allowance_s) * self._budget, self._budget
-        )  # of a second
-        self._allowance_s = now
+        gained = (now - self._allowance_s) * self._budget
+        self._allowance, self._allowance_s = min(self._allowance + gained, self._budget), now  # of a second
         if size > self._allowance:
             self._notify(f"others get {self._budget / 1e3:g} kB/s in all: link.max_other_peers_rate", True)
             return False

@@ -59,9 +59,8 @@ def ports() -> list[SerialDevice]:
 
 def _described(device: Any) -> str:
     number = f"serial number {device.serial_number}" if device.serial_number else ""
-    return ", ".join(
-        text for text in (device.manufacturer, device.product or device.description, number) if text
-    )
+    texts = device.manufacturer, device.product or device.description, number
+    return ", ".join(filter(None, texts))
 
 
 def listen(
@@ -136,9 +135,8 @@ def _mavlink(data: bytes) -> Recognised | None:
     if len(frames) < MIN_RECOGNISED:
         return None
     senders = sorted({(one.system, one.component) for one in frames})
-    return Recognised(
-        "mavlink", ", ".join(f"system {system} component {component}" for system, component in senders)
-    )
+    texts = [f"system {system} component {component}" for system, component in senders]
+    return Recognised("mavlink", ", ".join(texts))
 
 
 def _nmea(data: bytes) -> Recognised | None:
@@ -160,9 +158,8 @@ def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
             readings = driver.feed(data)
             wasted = driver.bytes_skipped / len(data)
             if len(readings) >= MIN_RECOGNISED and wasted < 0.5:
-                texts = ", ".join(
-                    f"{key} = {value!r}" for key, value in options.items() if key != "sensitivity"
-                )
+                shown = {key: value for key, value in options.items() if key != "sensitivity"}
+                texts = ", ".join(f"{key} = {value!r}" for key, value in shown.items())
                 rate = f"{len(readings) / seconds:.0f} readings/s"
                 yield Recognised(name, f"driver {name}, {rate}" + (f", with {texts}" if texts else ""))
 

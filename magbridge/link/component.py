@@ -82,14 +82,12 @@ class Commands:
         is_ours = number in ABOUT_MESSAGES and values[0] >= FIRST_DIALECT_ID and values[0] in self._messages
         if target == 0 and not is_ours:
             return
-        command = self._commands.get(number)
+        command, may_change = self._commands.get(number), self._component.parameter_service.may_change
         if self._is_flood(message.system, message.component):
             text = f"more than {MAX_COMMAND_RATE} commands a second from {message.system}:{message.component}"
             self._output.announce("flood", text, MAV_SEVERITY.WARNING)
             result = MAV_RESULT.TEMPORARILY_REJECTED
-        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._component.parameter_service.may_change(
-            message
-        ):
+        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not may_change(message):
             text = f"{message.system}:{message.component} may not set a rate: no station, no autopilot"
             self._output.announce("rate", text, MAV_SEVERITY.WARNING, recurring=True)
             result = MAV_RESULT.DENIED
@@ -354,12 +352,10 @@ class Component:
     def send_status(self) -> None:
         """Send MAG_STATUS, then those of `more_reports`."""
         codec, vehicle = self.codec, self.vehicle
-        clock = vehicle.clock
+        clock, offset_us = vehicle.clock, vehicle.clock.offset_us(codec.now_us)
         payload = STATUS.payload(
             time_usec=codec.utc_us,
-            vehicle_clock_offset=(
-                round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0
-            ),
+            vehicle_clock_offset=round(offset_us) - codec.utc_offset_us if clock.known else 0,
             uptime=(codec.now_us - self._start_us) // 1_000_000 & MASK,
             calibration_id=self.publisher.calibration_id,
             link_frames=codec.frames & MASK,

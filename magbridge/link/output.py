@@ -145,9 +145,8 @@ class Output:
         if text == last_text and not (recurring and elapsed_us >= ANNOUNCEMENT_INTERVAL_US):
             return
         if elapsed_us < ANNOUNCEMENT_INTERVAL_US:
-            self.run_once(
-                timer, last_us + ANNOUNCEMENT_INTERVAL_US, lambda _: self.announce(key, text, severity)
-            )
+            end_us = last_us + ANNOUNCEMENT_INTERVAL_US
+            self.run_once(timer, end_us, lambda _: self.announce(key, text, severity))
             return
         self._announced[key] = text, now_us
         self.send_statustext(text, severity)

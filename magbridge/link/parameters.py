@@ -261,9 +261,8 @@ class ParameterService:
             who = f"{message.system}:{message.component}"
             self._refuse(name, f"only a station or the autopilot sets it, not {who}")
         elif not self._parameters.set(name, value):
-            self._refuse(
-                name, f"{value:.6g} is not within {row.low:.6g} to {row.high:.6g} {row.unit}".rstrip()
-            )
+            limits = f"{row.low:.6g} to {row.high:.6g} {row.unit}".rstrip()
+            self._refuse(name, f"{value:.6g} is not within {limits}")
         else:
             text = f"{name} = {value:.6g}, set by {message.system}:{message.component}"
             self._output.announce(f"set {name}", text, MAV_SEVERITY.NOTICE)

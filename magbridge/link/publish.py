@@ -144,10 +144,8 @@ class Publisher:
     def _imu(self, sample: Sample, corrected: Corrected, *_: object) -> None:
         x, y, z = corrected.field
         time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
-        payload = IMU_FIELD.pack(
-            time_us, x * GAUSS_PER_NT, y * GAUSS_PER_NT, z * GAUSS_PER_NT, MAGNETOMETER, 0
-        )
-        self._output.put(IMU, payload)
+        field = x * GAUSS_PER_NT, y * GAUSS_PER_NT, z * GAUSS_PER_NT
+        self._output.put(IMU, IMU_FIELD.pack(time_us, *field, MAGNETOMETER, 0))
 
     def _named(self, sample: Sample, corrected: Corrected, anomaly: float, _: Attitude) -> None:
         boot_ms = (sample.time_us - self._start_us) // 1000 & MASK
@@ -207,9 +205,8 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
             raise ConfigError(path, f"publish.{name}", one_of(name, sorted(LIMITS)))
         low, high = LIMITS[name]
         if not low <= rate <= high:
-            raise ConfigError(
-                path, f"publish.{name}", f"expected a rate from {low:g} to {high:g} Hz, not {rate:g}"
-            )
+            expected = f"expected a rate from {low:g} to {high:g} Hz, not {rate:g}"
+            raise ConfigError(path, f"publish.{name}", expected)
 
 
 class MessageRates:

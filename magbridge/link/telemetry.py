@@ -45,10 +45,8 @@ class Extractor:
         if self.field.code == "s":
             raise ConfigError(path, f"{key}.field", f"a number, but {layout.name}.{field_name} is text")
         if (self.index is None) != (count == 0) or (count and not 0 <= (self.index or 0) < count):
-            wanted = (
-                f"{field_name}[0] to {field_name}[{count - 1}]" if count else f"{field_name} without an index"
-            )
-            raise ConfigError(path, f"{key}.field", f"{wanted}, not {quantity.field!r}")
+            place = f"[0] to {field_name}[{count - 1}]" if count else " without an index"
+            raise ConfigError(path, f"{key}.field", f"{field_name}{place}, not {quantity.field!r}")
         self.match: list[tuple[Field, str | float]] = []
         for one, value in quantity.match.items():
             place = f"{key}.match.{one}"
@@ -117,9 +115,8 @@ class TelemetryMap:
                 layout = spec(what.message)
             except KeyError:
                 hint = suggestion(what.message, MESSAGE_IDS)
-                raise ConfigError(
-                    path, f"telemetry.{name}.message", f"unknown MAVLink message {what.message!r}{hint}"
-                ) from None
+                unknown = f"unknown MAVLink message {what.message!r}{hint}"
+                raise ConfigError(path, f"telemetry.{name}.message", unknown) from None
             self._by_id.setdefault(layout.id, []).append(Extractor(name, what, layout, path))
             self._times[layout.id] = own_time(layout)
 
@@ -193,11 +190,8 @@ MAX_VALID_SPEED_M_S: Final = 1e4
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """Largest magnitudes of latitude and longitude, 1e-7 deg."""
 
-DISTANCE_AND_SPEED = dict.fromkeys("xyz", MAX_DISTANCE_M) | dict.fromkeys(
-    ("vx", "vy", "vz"), MAX_VALID_SPEED_M_S
-)
-
-
+SPEED = dict.fromkeys(("vx", "vy", "vz"), MAX_VALID_SPEED_M_S)
+DISTANCE_AND_SPEED = dict.fromkeys("xyz", MAX_DISTANCE_M) | SPEED
 VALID_BY_NAME: Final[dict[str, dict[str, float]]] = {
     "ATTITUDE": dict.fromkeys(("roll", "pitch", "yaw"), MAX_ANGLE_RAD),
     "GLOBAL_POSITION_INT": {"lat": LATITUDE_E7, "lon": LONGITUDE_E7},

@@ -246,9 +246,8 @@ class VehicleState:
                 self._output.announce(f"system {message.system}", text, MAV_SEVERITY.NOTICE)
             return False
         if message.component == self.component:
-            self._output.announce(
-                "twin", f"another program sends as {self.system}:{self.component}", MAV_SEVERITY.WARNING
-            )
+            text = f"another program sends as {self.system}:{self.component}"
+            self._output.announce("twin", text, MAV_SEVERITY.WARNING)
             return False
         self.count(message, t_us)
         if message.component == self.autopilot:
@@ -335,17 +334,15 @@ class VehicleState:
         self.clock.reset()
         self.on_reboot()
         self._stamps.clear()
-        self._output.send_statustext(
-            f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING
-        )
+        text = f"autopilot {self.system}:{self.autopilot} rebooted"
+        self._output.send_statustext(text, MAV_SEVERITY.WARNING)
 
     def _change(self, t_us: int) -> None:
         """Count a change of the boot clock at `t_us`; report two autopilots after `TWICE` recent changes."""
         self._changes = [*(when for when in self._changes if t_us - when < CHANGES_US), t_us][-TWICE:]
         if len(self._changes) == TWICE:
-            self._output.announce(
-                "autopilots", f"two autopilots send as {self.system}:{self.autopilot}", MAV_SEVERITY.WARNING
-            )
+            text = f"two autopilots send as {self.system}:{self.autopilot}"
+            self._output.announce("autopilots", text, MAV_SEVERITY.WARNING)
 
 
 def _elapsed_ms(one_ms: int, other_ms: int) -> int:

@@ -19,6 +19,7 @@ has been set.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
@@ -345,19 +346,17 @@ class FrameLogWriter:
         in_doubt = False
         for one in messages:
             if one.id in (BAD_DATA, WRAPPER.id):
-                frames += self._wrap(one.frame, sequence_offset=0)
+                frames += self._wrap(one.frame, ahead=0)
             else:
                 frames.append(one.frame)
             in_doubt |= one.id == BAD_DATA or not one.known
-        return frames + self._wrap(pending, sequence_offset=1) if in_doubt else frames
+        return frames + self._wrap(pending, ahead=1) if in_doubt else frames
 
-    def _wrap(self, data: bytes, sequence_offset: int) -> list[bytes]:
+    def _wrap(self, data: bytes, ahead: int) -> list[bytes]:
         data = without_secrets(data)
         pieces = [data[i : i + WRAPPED_BYTES] for i in range(0, len(data), WRAPPED_BYTES)]
-        return [
-            self._codec.pack(WRAPPER.name, ahead=sequence_offset, length=len(piece), data=piece)
-            for piece in pieces
-        ]
+        pack = partial(self._codec.pack, WRAPPER.name, ahead=ahead)
+        return [pack(length=len(piece), data=piece) for piece in pieces]
 
 
 class FrameLogReader:

@@ -159,9 +159,8 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns
         for name in named:
             if name not in ("x", "y", "z", "total_field", "-", *COLUMN_READERS):
-                raise ValueError(
-                    f"columns: {name!r} is none of x y z total_field {' '.join(COLUMN_READERS)} -"
-                )
+                known = " ".join(COLUMN_READERS)
+                raise ValueError(f"columns: {name!r} is none of x y z total_field {known} -")
             if name != "-" and named.count(name) > 1:
                 raise ValueError(f"columns: {name!r} stands there twice")
         field = {"x", "y", "z", "total_field"} & set(named)
@@ -185,9 +184,8 @@ class Ascii(FramedDriver):
         self._keys = [key.encode(ENCODING) for key in options.keys]
         self.is_scalar = "total_field" in columns
         self._field = [columns.index(name) for name in (("total_field",) if self.is_scalar else "xyz")]
-        self._others = [
-            (name, at, COLUMN_READERS[name]) for at, name in enumerate(columns) if name in COLUMN_READERS
-        ]
+        readers = COLUMN_READERS
+        self._others = [(name, at, readers[name]) for at, name in enumerate(columns) if name in readers]
         self._used = [*self._field, *(index for _, index, _ in self._others)]
         self._prefix = options.prefix.encode(ENCODING)
         self._separator = options.separator.encode(ENCODING) or None
