@@ -62,10 +62,8 @@ def events(folder: Path) -> list[Event]:
             lon=round(PLACE[1] * 1e7),
         )
         made.append(Event(time_us - 400_000, Channel.LINK, frame))
-        yaw, pitch = (
-            0.7 * (k // 40) + 0.1 * rng.normal(),
-            (0.45 if k // 40 % 2 else -0.4) + 0.05 * rng.normal(),
-        )
+        yaw = 0.7 * (k // 40) + 0.1 * rng.normal()
+        pitch = (0.45 if k // 40 % 2 else -0.4) + 0.05 * rng.normal()
         unit = np.array([0.4 * np.cos(yaw) - 0.9 * pitch, 0.4 * np.sin(yaw), 0.9 + 0.4 * pitch * np.cos(yaw)])
         total = 51_900.0 + 40.0 * np.sin(k / 400.0)
         x, y, z = np.linalg.solve(A, total * unit / np.linalg.norm(unit)) + T + SHIFT + rng.normal(size=3)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Command
-from fed import logged, named, received, texts
+from fed import fed, logged, named, received, texts
 from small import START, small_bridge
 
 from magbridge import logs
@@ -48,9 +48,8 @@ def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
         if k % 4 == 0:
             battpos = {"time_boot_ms": (t_us - BOOT) // 1000 - 25, "value": sin(k / 90), "name": "battpos"}
             yield Event(t_us + 4_000, Channel.LINK, autopilot.pack("NAMED_VALUE_FLOAT", **battpos))
-        while asked := [
-            ts1 for ts1 in pipeline.component.vehicle.clock._asked if ts1 // 1000 > t_us - 50_000
-        ]:
+        clock = pipeline.component.vehicle.clock
+        while asked := [ts1 for ts1 in clock._asked if ts1 // 1000 > t_us - 50_000]:
             answer = {"tc1": (t_us + 5_000 - BOOT) * 1000, "ts1": asked[0]}
             yield Event(t_us + 8_000, Channel.LINK, autopilot.pack("TIMESYNC", **answer))
 
@@ -92,15 +91,8 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
     assert result["same_samples"] > 0.9 * result["samples"]
     assert agreement(published, Recorded(first)) == {"late_s": 0.0}
     more = {"files": second, "messages": recorded.messages, "bytes": 1, "seconds": 1.0, "same_config": True}
-    words = summary(
-        {
-            "runs": [
-                result
-                | more
-                | {"identical": False, "is_cut": False, "first_difference": 0, "beyond": 0, "damages": 0}
-            ]
-        }
-    )
+    more |= {"identical": False, "is_cut": False, "first_difference": 0, "beyond": 0, "damages": 0}
+    words = summary({"runs": [result | more]})
     assert f"begins {recorded.late:.1f} s into the run" in words
 
 
@@ -192,10 +184,8 @@ def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
         "host clock was never set: no date, no main field"
     ]
     step = clock_step(3_000_000, START)
-    sent = pipeline.feed(Event(3_000_000, Channel.STATE, step)) + pipeline.feed(
-        Event(4_000_000, Channel.STATE, b"")
-    )
-    assert "host clock is set" in texts(received(sent))
+    set_it, later = Event(3_000_000, Channel.STATE, step), Event(4_000_000, Channel.STATE, b"")
+    assert "host clock is set" in texts(fed(pipeline, set_it, later))
 
 
 # ---- the one clock, made of the host's two -----------------------------------------------------------------
@@ -262,10 +252,8 @@ def test_an_overloaded_bridge_omits_only_optional_work(tmp_path: Path, silence_s
                 stalled_us = START + 1_000_000 * second
                 yield Event(stalled_us, Channel.STATE, standstill(stalled_us, 900_000))
             if 20 <= second < 20 + silence_s:
-                yield from (
-                    Event(START + 50_000 * k, Channel.STATE, b"")
-                    for k in range(20 * second, 20 * second + 20)
-                )
+                for k in range(20 * second, 20 * second + 20):
+                    yield Event(START + 50_000 * k, Channel.STATE, b"")
             else:
                 yield from events(pipeline, 20 * second, 20 * (second + 1))
 
@@ -273,10 +261,8 @@ def test_an_overloaded_bridge_omits_only_optional_work(tmp_path: Path, silence_s
     pipeline = small_bridge(tmp_path, messages)
     sent = logged(pipeline, overloaded(pipeline), tmp_path / "logs")
     came = received(sent)
-    assert [text.partition(":")[0] for text in texts(came) if "overload" in text] == [
-        "overload",
-        "overload is over",
-    ]
+    told = [text.partition(":")[0] for text in texts(came) if "overload" in text]
+    assert told == ["overload", "overload is over"]
     assert len(named(came, "MAG_FIELD")) == 800 - 20 * silence_s
     # from the 4th stall to 5 s after the last one, a message is sent with every 4th sample
     omitted = len(named(came, "MAG_FIELD")) - len(named(came, "HIGHRES_IMU"))
@@ -316,9 +302,8 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
     def events() -> Iterator[Event]:
         for k in range(40):
             sets = [asked[k]] if k in asked else []
-            yield from second(
-                k, *(station.pack("PARAM_SET", param_id=n, param_value=v, **to) for n, v in sets)
-            )
+            frames = [station.pack("PARAM_SET", param_id=n, param_value=v, **to) for n, v in sets]
+            yield from second(k, *frames)
 
     logged(small_bridge(tmp_path), events(), tmp_path / "logs")
     logs.write(logs.read(sorted((tmp_path / "logs").iterdir())), log)
@@ -361,9 +346,8 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
     more = before != after
     assert (after[more] == before[more] + Quality.MOVING).all()
     assert (before[np.flatnonzero(more) + 1] & Quality.MOVING != 0).all()
-    assert 3 <= more.sum() <= 7, (
-        "the last sample before each of seven motions, but where both are of one time"
-    )
+    # the last sample before each of seven motions, but where both are of one time
+    assert 3 <= more.sum() <= 7
 
 
 def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:

@@ -188,9 +188,8 @@ def test_a_receiver_that_is_led_away_slowly_is_noticed_by_the_field() -> None:
     assert noticed.size
     assert noticed[0] - BEGIN < 100.0
     wrong = run.seconds >= BEGIN
-    assert np.sqrt(np.mean(run.error[wrong] ** 2 / 2.0 / run.sigma[wrong] ** 2)) < 2.0, (
-        "suspicion widens sigma"
-    )
+    standardised = np.sqrt(np.mean(run.error[wrong] ** 2 / 2.0 / run.sigma[wrong] ** 2))
+    assert standardised < 2.0, "suspicion widens sigma"
     assert (run.gnss[run.seconds >= noticed[0]] != GnssState.GOOD).all()
 
 

@@ -87,9 +87,8 @@ def test_the_autopilot_s_end_of_the_link_closes_and_opens_again(
     assert sequences == sorted(sequences)
     assert 50 * (away_s - 0.5) <= lost <= 100 * away_s + still
     came = after["samples"] - before["samples"]  # the bridge went on measuring
-    assert came == pytest.approx(
-        rig.fluxgate.encoder.sequence - made, abs=25 + still
-    )  # half a second on the way
+    on_the_way = 25 + still  # half a second
+    assert came == pytest.approx(rig.fluxgate.encoder.sequence - made, abs=on_the_way)
     assert after["samples_lost"] == before["samples_lost"]
     measured(recovers_s=back, messages_lost=lost)
     assert back < soon(within_s)
@@ -174,18 +173,13 @@ def test_a_log_is_read_while_the_bridge_measures(make_rig: MakeRig, key: bytes |
         """Send an FTP request; return its replies, which end with the burst or with a negative reply."""
         start = len(station.received)
         station.send_message("FILE_TRANSFER_PROTOCOL", **ftp(opcode, data, next(sequence), **options))
-        is_burst = opcode == Opcode.BURST
-        rig.until(
-            lambda: any(
-                done or kind == Opcode.NAK or not is_burst for kind, done, _ in replies(station, start)
-            )
-        )
+        end = {(Opcode.NAK, 0), (Opcode.ACK, 1), (Opcode.ACK, int(opcode == Opcode.BURST))}
+        rig.until(lambda: any((kind, done) in end for kind, done, _ in replies(station, start)))
         return replies(station, start)
 
     station.send_message("HEARTBEAT", type=6, autopilot=8)
-    assert ask(Opcode.OPEN_READ, f"@MAV_LOG/{LOG}".encode()) == [
-        (Opcode.ACK, 0, len(content).to_bytes(4, "little"))
-    ]
+    size = len(content).to_bytes(4, "little")
+    assert ask(Opcode.OPEN_READ, f"@MAV_LOG/{LOG}".encode()) == [(Opcode.ACK, 0, size)]
     data = b""
     while len(data) < len(content):
         burst = ask(Opcode.BURST, size=239, offset=len(data))

@@ -67,8 +67,11 @@ def test_intervals(link: Line) -> None:
 @pytest.mark.parametrize(
     ("message", "interval"),
     [
-        *((HEARTBEAT, k) for k in (-1, 1e9)),
-        *((FIELD, k) for k in (10, -2, nan)),
+        (HEARTBEAT, -1),
+        (HEARTBEAT, 1e9),
+        (FIELD, 10),
+        (FIELD, -2),
+        (FIELD, nan),
         (24, 1e3),
         (-1, 0),
         (1e30, 0),
@@ -186,9 +189,8 @@ def test_telemetry_is_requested_from_the_component_that_is_its_source(make_link:
     bench.run(12, 1, GLOBAL_POSITION_INT=5, BATTERY_STATUS=5)
     assert bench.asked == [("BATTERY_STATUS", 5.0)]
     assert bench.receivers == {25}
-    assert bench.requests.denied == {
-        "BATTERY_STATUS": "component 25 does not send BATTERY_STATUS at 5 Hz: UNSUPPORTED"
-    }
+    denied = "component 25 does not send BATTERY_STATUS at 5 Hz: UNSUPPORTED"
+    assert bench.requests.denied == {"BATTERY_STATUS": denied}
 
 
 def test_telemetry_that_another_component_sends_is_not_requested_from_the_autopilot(
@@ -253,9 +255,8 @@ def test_who_may_change_parameters_and_rates(
     fields = {"param_id": "MB_AGE_BATTPOS", "param_value": 1e6, "param_type": 9}
     received, text = spoken(link, texts_by(system, component, kind, "PARAM_SET", **fields))
     age = 1e6 if may else 30.0
-    assert [v.param_value for v in link.only(received, "PARAM_VALUE") if v.param_id == "MB_AGE_BATTPOS"] == [
-        age
-    ]
+    ages = [v.param_value for v in link.only(received, "PARAM_VALUE") if v.param_id == "MB_AGE_BATTPOS"]
+    assert ages == [age]
     assert link.component.parameters["MB_AGE_BATTPOS"] == age
     assert f"{system}:{component}" in text
     interval = {"command": MAV_CMD.SET_MESSAGE_INTERVAL, "param1": 60101, "param2": -1}

@@ -29,16 +29,15 @@ def test_next_deadline_is_when_something_is_sent(link: Line) -> None:
 
 
 def test_status(make_link: MakeLine) -> None:
-    link = make_link(
-        calibration_id=7, status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": 3}
-    )
+    status = {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": 3}
+    link = make_link(calibration_id=7, status=lambda: status)
     link.to(0)
     link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
     received = link.to(3)
-    status = link.only(received, "MAG_STATUS")[-1]
-    assert (status.samples, status.calibration_id, status.uptime, status.link_frames) == (5, 7, 3, 1)
-    assert (status.link_bytes_skipped, status.log_records) == (7, 3)
-    assert status.autopilot_state == MAG_PORT_STATE.OK
+    sent = link.only(received, "MAG_STATUS")[-1]
+    assert (sent.samples, sent.calibration_id, sent.uptime, sent.link_frames) == (5, 7, 3, 1)
+    assert (sent.link_bytes_skipped, sent.log_records) == (7, 3)
+    assert sent.autopilot_state == MAG_PORT_STATE.OK
     assert link.only(received, "HEARTBEAT")[-1].system_status == 4
 
 

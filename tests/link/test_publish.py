@@ -86,9 +86,8 @@ def test_standard_messages(line: Line) -> None:
     (vector,) = line.only(received, "DEBUG_VECT")
     assert (vector.name, vector.x, vector.y, vector.z) == ("mag_field", *CORRECTED.field)
     named = line.only(received, "NAMED_VALUE_FLOAT")
-    assert {one.name: one.value for one in named} == pytest.approx(
-        {"mag_total": 50_123.456789, "mag_sigma": 1.5}
-    )
+    values = {one.name: one.value for one in named}
+    assert values == pytest.approx({"mag_total": 50_123.456789, "mag_sigma": 1.5})
     named = line.only(publish(line, sample(START + 2_500_000), anomaly=-3.0), "NAMED_VALUE_FLOAT")
     assert {one.name for one in named} == {"mag_total", "mag_sigma", "mag_anom"}
     assert {one.time_boot_ms for one in named} == {2500}

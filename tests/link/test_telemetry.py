@@ -41,9 +41,8 @@ def test_scale_offset_and_match() -> None:
 
 
 def test_a_text_matches_whole() -> None:
-    named = {
-        name: Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": name}) for name in ("bat", "batteryone")
-    }
+    names = "bat", "batteryone"
+    named = {name: Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": name}) for name in names}
     for sent in ("bat", "batteryone", "batt", "ba", ""):  # ten bytes fill the field, without a zero
         got = values(named, "NAMED_VALUE_FLOAT", name=sent, value=0.5)
         assert got == [(name, 0.5, NOW) for name in named if name == sent]

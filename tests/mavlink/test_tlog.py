@@ -17,10 +17,8 @@ START = 1_700_000_000_000_000
 
 def records(count: int) -> list[bytes]:
     codec = Codec(1, 191)
-    return [
-        pack_record(START + 4 * i, i % 4, codec.pack("ATTITUDE", time_boot_ms=i, roll=0.1 * i))
-        for i in range(count)
-    ]
+    frames = [codec.pack("ATTITUDE", time_boot_ms=i, roll=0.1 * i) for i in range(count)]
+    return [pack_record(START + 4 * i, i % 4, frame) for i, frame in enumerate(frames)]
 
 
 def several_messages() -> bytes:
@@ -28,9 +26,8 @@ def several_messages() -> bytes:
     codec = Codec(1, 1)
     names = ("RAW_IMU", "ATTITUDE", "NAMED_VALUE_FLOAT", "HEARTBEAT")
     fields = ({"xmag": 5}, {"yaw": 1.5}, {"name": "battpos", "value": 2.0}, {"type": 12})
-    return b"".join(
-        pack_record(START + 4 * k, k % 4, codec.pack(names[k % 4], **fields[k % 4])) for k in range(24)
-    )
+    frames = [codec.pack(names[k % 4], **fields[k % 4]) for k in range(24)]
+    return b"".join(pack_record(START + 4 * k, k % 4, frame) for k, frame in enumerate(frames))
 
 
 def read(data: bytes, block_bytes: int = BLOCK_BYTES) -> tuple[list[bytes], LogReader]:
@@ -82,9 +79,8 @@ def test_damage_costs_only_the_records_it_touches(data: st.DataObject) -> None:
     touched = (begin + length - 1) // size - begin // size + 1
     # a stamp cannot be checked: noise that happens to end in a plausible one may stand before a good frame
     assert len(set(found) & set(all_records)) >= 30 - touched - 3
-    assert sum(map(len, found)) + reader.bytes_skipped == len(whole) - len(
-        whole[begin : begin + length]
-    ) + len(noise)
+    removed = len(whole[begin : begin + length])
+    assert sum(map(len, found)) + reader.bytes_skipped == len(whole) - removed + len(noise)
 
 
 def test_a_log_cut_anywhere_reads_to_its_last_whole_record() -> None:

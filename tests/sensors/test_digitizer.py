@@ -113,11 +113,8 @@ def test_the_data_sheet_s_values() -> None:
     driver = open_driver("hmr2300", {})
     hexes = ("7530 57E4 3A98", "1D4C 0000 E2B4", "C568 A81C 8AD0", "1D4C 0000 E2B4", "1D4C 0000 E2B4")
     readings = driver.feed(b"".join(bytes.fromhex(text) + b"\r" for text in hexes))
-    assert [reading.counts for reading in readings[:3]] == [
-        (30_000, 22_500, 15_000),
-        (7_500, 0, -7_500),
-        (-15_000, -22_500, -30_000),
-    ]
+    counts = [reading.counts for reading in readings[:3]]
+    assert counts == [(30_000, 22_500, 15_000), (7_500, 0, -7_500), (-15_000, -22_500, -30_000)]
     assert readings[0].field == pytest.approx((200_000.0, 150_000.0, 100_000.0))
     assert [reading.saturated for reading in readings] == [True, False, True, False, False]
 
@@ -132,23 +129,14 @@ def test_ascii_lines() -> None:
         b" 15,000  - 7,500        0\r",
     )
     readings = driver.feed(b"".join(lines))
-    assert [reading.counts for reading in readings] == [
-        (15_000, -7_500, 0),
-        (-30_000, 1_234, -56),
-        (15_000, -7_500, 0),
-    ]
+    counts = [reading.counts for reading in readings]
+    assert counts == [(15_000, -7_500, 0), (-30_000, 1_234, -56), (15_000, -7_500, 0)]
     assert driver.frames_bad == 1
 
 
 def test_start_up_commands() -> None:
-    assert open_driver("hmr2300", {"rate": 100}).start() == (
-        b"\x1b",
-        b"*99WE\r",
-        b"*99B\r",
-        b"*99WE\r",
-        b"*99R=100\r",
-        b"*99C\r",
-    )
+    commands = b"\x1b", b"*99WE\r", b"*99B\r", b"*99WE\r", b"*99R=100\r", b"*99C\r"
+    assert open_driver("hmr2300", {"rate": 100}).start() == commands
     assert open_driver("hmr2300", {"output": "ascii", "device": 7}).start()[2] == b"*07A\r"
     assert open_driver("hmr2300", {"rate": 100}).period == 0.01
 

@@ -69,11 +69,8 @@ def test_generation_2() -> None:
 
 
 def test_generation_2_other_columns_units_and_types() -> None:
-    columns = [
-        (I24, "raw", "count"),
-        (U16, "therm", "C"),
-        *[(F32, name, "uT") for name in ("z", "pad", "x", "y")],
-    ]
+    columns = [(I24, "raw", "count"), (U16, "therm", "C")]
+    columns += [(F32, name, "uT") for name in ("z", "pad", "x", "y")]
     twinleaf = driver(columns=["x", "y", "z"], temperature="therm", range=25_000.0)
     twinleaf.feed(generation_2(columns, stream=3))
     payload = (9).to_bytes(3, "little") + b"\x05" + b"abc" + pack("<Hffff", 21, 41.5, 9.0, 20.5, -3.25)
