@@ -346,16 +346,16 @@ class FrameLogWriter:
         in_doubt = False
         for one in messages:
             if one.id in (BAD_DATA, WRAPPER.id):
-                frames += self._wrap(one.frame, ahead=0)
+                frames += self._wrap(one.frame, is_ahead=False)
             else:
                 frames.append(one.frame)
             in_doubt |= one.id == BAD_DATA or not one.known
-        return frames + self._wrap(pending, ahead=1) if in_doubt else frames
+        return frames + self._wrap(pending, is_ahead=True) if in_doubt else frames
 
-    def _wrap(self, data: bytes, ahead: int) -> list[bytes]:
+    def _wrap(self, data: bytes, *, is_ahead: bool) -> list[bytes]:
         data = without_secrets(data)
         pieces = [data[i : i + WRAPPED_BYTES] for i in range(0, len(data), WRAPPED_BYTES)]
-        pack = partial(self._codec.pack, WRAPPER.name, ahead=ahead)
+        pack = partial(self._codec.pack, WRAPPER.name, ahead=int(is_ahead))
         return [pack(length=len(piece), data=piece) for piece in pieces]
 
 
