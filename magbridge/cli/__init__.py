@@ -23,11 +23,9 @@ ROOMS = ("bridge", "calibrate", "correct", "diagnose", "fleet", "logs", "navigat
 """Modules with commands; importing a module adds its commands to `app`."""
 for _room in ROOMS:
     import_module(f"{__name__}.{_room}")
+ANALYSIS = "scipy xarray netCDF4 matplotlib ppigrf filterpy rich pandas threadpoolctl"
 EXTRAS = {
-    **dict.fromkeys(
-        ["scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas", "threadpoolctl"],
-        "analysis",
-    ),
+    **dict.fromkeys(ANALYSIS.split(), "analysis"),
     "harmonica": "grids",
     "pymavlink": "dialect",
     "nicegui": "monitor",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
+from functools import partial
 from math import inf, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -54,30 +55,21 @@ def demo(
     show
         With --live: open the page in a browser.
     """
+    if live and json:
+        raise WrongUse("--json: demo --live runs until Ctrl-C and has no result; leave one of them out")
+    notify = partial(print, file=sys.stderr)
     if live:
-        if json:
-            raise WrongUse("--json: demo --live runs until Ctrl-C and has no result; leave one of them out")
-        _live(out, seed, port, show=show)
+        from magbridge.monitor.serve import serve
+        from sitl.live import MAP, flying
+
+        with new_folder(out), flying(out, seed, notify) as link:
+            serve(link, 0, "127.0.0.1", port, grid=out / MAP, show=show)
         return
     from sitl import demo as demonstration
 
     with new_folder(out):
-        result = demonstration.demo(out, seed, notify=lambda text: print(text, file=sys.stderr))
+        result = demonstration.demo(out, seed, notify)
     cli.print_result(result, demonstration.summary(result), json)
-
-
-def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
-    """Simulate the demonstration's glider in real time and serve its page until interrupted."""
-    from magbridge.monitor.serve import serve
-    from sitl.live import MAP, flying
-
-    def notify(text: str) -> None:
-        print(text, file=sys.stderr)
-
-    with new_folder(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        with flying(folder, seed, notify) as link:
-            serve(link, 0, "127.0.0.1", port, grid=folder / MAP, show=show)
 
 
 @cli.command("run --config bridge.toml [--check [--live] [--json]]")
@@ -197,9 +189,7 @@ def replay(
 
 
 @cli.command("dialect -o DIR")
-def dialect(
-    *, output: Annotated[cli.Folder, Parameter(name=["--output", "-o"])], json: cli.Json = False
-) -> None:
+def dialect(*, output: cli.FolderOutput, json: cli.Json = False) -> None:
     """Write the MAVLink dialect for other programs: XML files and Python modules for pymavlink.
 
     magbridge.xml defines the common messages and the messages of magbridge; magbridge_ardupilotmega.xml also

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter, validators
 
 import magbridge as mb
-from magbridge.calibration.fitting import FIT_RANGES
 from magbridge.cli import common as cli
 from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.files import digest
@@ -30,13 +29,6 @@ MAX_LISTED_CONTRIBUTIONS = 5
 ALL_COMPASSES = "all"
 """Value of ``--compass`` that requests a calibration of each compass."""
 
-
-def _range_check(option: str) -> validators.Number:
-    """Return a validator of an option of the fit."""
-    low, high = FIT_RANGES[option]
-    return validators.Number(gte=low, lte=high)
-
-
 SCALAR_REFERENCE_SIGMA_NT = 1.0
 """Default 1-sigma of a scalar magnetometer's reading as the reference field, nT."""
 
@@ -44,15 +36,10 @@ SCALAR_REFERENCE_SIGMA_NT = 1.0
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ModelOptions:
-    """Options for the model of the calibration and its fit.
+    """Options for the method of the fit, and for what is known about the vehicle.
 
     Parameters
     ----------
-    parameter
-        A column with the position of a moving mass, or a current; may be repeated. auto: the columns of the
-        log that improve the prediction of held-out parts (method auto).
-    order
-        Highest total degree of the polynomials in the parameters.
     method
         Use auto. If only the main field or a map is known, auto uses survey, which estimates the crustal
         field with the calibration; else it fits to the known field. For comparison: nominal (one ellipsoid),
@@ -61,8 +48,6 @@ class ModelOptions:
     vehicle
         A vehicle.toml with the positions of the moving masses relative to the sensor (method auto). With
         --fleet: the vehicle's name in the fleet, by default from the catalogue's entries for the logs.
-    position_sigma
-        1-sigma in m of the slow drift of dead-reckoned positions (method survey); 0: positions are exact.
     filter_cutoff
         Cut-off frequency in Hz of the sensor's first-order anti-alias filter; 0: no filter. The fit undoes
         its attenuation; correct and the bridge undo its lag.
@@ -74,11 +59,8 @@ class ModelOptions:
         With --fleet: name of the vehicle's refit, if the logs are not catalogued; by default a new one.
     """
 
-    parameter: tuple[str, ...] = ()
-    order: Annotated[cli.Whole, Parameter(validator=_range_check("order"))] = 3
     method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto"
     vehicle: str = ""
-    position_sigma: Annotated[float, Parameter(validator=_range_check("position_sigma"))] = 0.0
     filter_cutoff: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0
     fleet: str = ""
     refit: str = ""
@@ -88,22 +70,12 @@ class ModelOptions:
         """Path of the vehicle.toml; None if it is not given."""
         return Path(self.vehicle) if self.vehicle and not self.fleet else None
 
-    @property
-    def named(self) -> tuple[str, ...]:
-        """Names of the given parameters, without ``auto``."""
-        return tuple(name for name in self.parameter if name != "auto")
-
-    def check(self) -> None:
-        """Check that the options are compatible.
-
-        WrongUse: they are not.
-        """
+    def check(self, parameter: tuple[str, ...]) -> None:
+        """Check that the options are compatible with each other and `parameter`; WrongUse: they are not."""
         if self.masses and self.method != "auto":
             raise WrongUse(f"--vehicle: expected --method auto, got {self.method}, which has no use for it")
-        if "auto" in self.parameter and (self.method != "auto" or self.fleet or self.masses):
-            raise WrongUse(
-                "--parameter auto: expected --method auto without --vehicle and --fleet; name parameters"
-            )
+        if "auto" in parameter and (self.method != "auto" or self.fleet or self.masses):
+            raise WrongUse("--parameter auto: expected --method auto without --vehicle, --fleet; name them")
         if self.fleet and self.method != "auto":
             raise WrongUse(f"--fleet: expected --method auto, got {self.method}; leave one of them out")
 
@@ -117,9 +89,6 @@ class ReferenceOptions:
     ----------
     grid
         An anomaly grid to add to the IGRF.
-    base
-        A base station's log (total_field, or a vector), whose variation is added to the reference field. A
-        log of an observatory (IAGA-2002) among the logs is used in the same way.
     reference
         mean: the mean of the log's own readings, if the Earth's field is not known; site_bias is then by
         default 2 % of the mean. scalar: the column of --scalar, if that magnetometer is compensated or far
@@ -131,9 +100,8 @@ class ReferenceOptions:
     """
 
     grid: Path | None = None
-    base: cli.Base = None
     reference: Literal["mean", "scalar"] | None = None
-    site_bias: Annotated[float | None, Parameter(validator=_range_check("site_bias"))] = None
+    site_bias: Annotated[float | None, Parameter(validator=cli.fit_range("site_bias"))] = None
     heading_reference: cli.Heading = None
 
     def apply(self, deployment: xr.Dataset, scalar: str) -> tuple[xr.Dataset, float | None]:
@@ -161,13 +129,14 @@ class _Request:
 
     files: tuple[Path, ...]
     output: Path
+    fit: cli.FitOptions
     model: ModelOptions
     truth: ReferenceOptions
     scalar: cli.ScalarOptions
     plot: Path | None
     force: bool
     reading: cli.ReadingOptions
-    anomalies: AnomalyGrid | None = field(default=None)
+    anomalies: AnomalyGrid | None
 
     def of_compass(self, number: int) -> _Request:
         """Return the arguments for the compass `number`; the names of written files then contain it."""
@@ -187,6 +156,7 @@ class _Request:
 def calibrate(
     *files: Path,
     output: cli.CalibrationOutput,
+    fit: cli.FitOptions = cli.NO_PARAMETERS,
     model: ModelOptions = PHYSICAL_MODEL,
     truth: ReferenceOptions = MAIN_FIELD,
     scalar: cli.ScalarOptions = cli.NO_SCALAR,
@@ -216,13 +186,13 @@ def calibrate(
         Print the result, or the error, as one JSON object, with the paper's M, S and T at the middle of each
         parameter's range. With --compass all, one result for each compass.
     """
-    model.check()
+    model.check(fit.parameter)
     scalar.check(is_reference=truth.reference == "scalar")
-    cli.logs_to_read(files, output, model.masses, truth.grid, truth.base)
+    cli.logs_to_read(files, output, model.masses, truth.grid, fit.base)
     cli.without_dask()
 
     anomalies = mb.read_grid(truth.grid) if truth.grid else None
-    request = _Request(files, output, model, truth, scalar, plot, force, reading, anomalies)
+    request = _Request(files, output, fit, model, truth, scalar, plot, force, reading, anomalies)
     results = _each_compass(request) if reading.compass == ALL_COMPASSES else {"": _calibrate(request)}
     facts: dict[str, Any] = {number: found for number, (found, _) in results.items()}
     text = "\n".join(sentence for _, sentence in results.values())
@@ -245,11 +215,13 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
             logs_digests = {digest(file) for file in request.files}
             start = predict(model.fleet, model.vehicle, model.refit, logs_digests)
     with waiting("reading"):
-        logs = cli.by_base_station(read_each(request.files, options=request.reading.options), truth.base)
+        logs = cli.by_base_station(
+            read_each(request.files, options=request.reading.options), request.fit.base
+        )
         deployment = join(logs)
         if request.reading.options.strict:
             refuse_repeated(deployment)
-    require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *model.named))
+    require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *request.fit.named))
     deployment = with_true_heading(deployment, truth.heading_reference)
     cli.note_losses(deployment.attrs)
     deployment, site_bias = truth.apply(deployment, scalar)
@@ -291,28 +263,23 @@ def _fit(
     from magbridge.calibration.fitting.pose import read_vehicle
     from magbridge.calibration.fitting.sources import unused_logs
 
-    model, anomalies = request.model, request.anomalies
-    names = model.parameter or (start.names if start else ())
-    options: dict[str, Any] = {"vehicle": read_vehicle(model.masses)} if model.masses else {}
+    model, asked, anomalies = request.model, request.fit, request.anomalies
+    names = asked.parameter or (start.names if start else ())
+    options: dict[str, Any] = asked.drift
+    if model.masses:
+        options["vehicle"] = read_vehicle(model.masses)
     with cli.naming(deployment), waiting("fitting"):
         names = cli.chosen_parameters(
-            names, deployment, grid=anomalies, order=model.order, site_bias=site_bias
+            names, deployment, grid=anomalies, order=asked.order, site_bias=site_bias
         )
-        read = (*request.files, *request.reading.sensor_log, *filter(None, [request.truth.base]))
+        read = (*request.files, *request.reading.sensor_log, *filter(None, [asked.base]))
         data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
         cli.complain_all(unused_logs(logs, data))
         data = unfiltered(data, model.filter_cutoff) if model.filter_cutoff else data
-        if model.position_sigma:
-            if not (data.lacks_rock and model.method in ("auto", "survey")):
-                raise WrongUse(
-                    "--position-sigma: positions matter only where the crustal field is estimated (method "
-                    "survey); leave the option out"
-                )
-            options["position_sigma"] = model.position_sigma
         if start:
-            found, remarks, worth = _from_fleet(start, data, model.order, site_bias=site_bias, **options)
+            found, remarks, worth = _from_fleet(start, data, asked.order, site_bias=site_bias, **options)
         else:
-            found, remarks = _fitted(logs, data, model, site_bias=site_bias, **options)
+            found, remarks = _fitted(logs, data, model.method, asked.order, site_bias=site_bias, **options)
             worth = {}
     refused = not (found.supported or request.force)
     cli.complain_all((*found.warnings[refused:], *remarks, *_undeclared_columns(deployment, data, found)))
@@ -320,16 +287,16 @@ def _fit(
 
 
 def _fitted(
-    logs: list[xr.Dataset], data: Observations, model: ModelOptions, **options: Any
+    logs: list[xr.Dataset], data: Observations, method: str, order: int, **options: Any
 ) -> tuple[Fit, list[str]]:
     """Return the fit, and a list with a warning if several logs appear to be of different vehicles."""
     from magbridge.calibration.fitting.sources import heterogeneous_logs
 
     def refitted(part: Observations) -> Fit:
-        return mb.fit(part, model.method, model.order)
+        return mb.fit(part, method, order)
 
     try:
-        found = mb.fit(data, model.method, model.order, **options)
+        found = mb.fit(data, method, order, **options)
     except CalibrationError as error:
         if reason := heterogeneous_logs(logs, data, None, refitted):
             raise CalibrationError(reason.text) from error
@@ -373,18 +340,12 @@ def _with_scalar(
     from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns
 
     scalar, truth = request.scalar, request.truth
-    names = request.model.named or telemetry_columns(deployment, scalar.scalar)
+    names = request.fit.named or telemetry_columns(deployment, scalar.scalar)
     is_known = request.anomalies is not None or ("reference_field" in deployment and truth.reference is None)
     fit = calibrate_scalar(
-        deployment,
-        calibration,
-        scalar.scalar,
-        names,
-        grid=request.anomalies,
-        map_known=is_known,
-        lag=scalar.lag_s,
-        lever=scalar.lever_m or (0.0, 0.0, 0.0),
-    )
+        deployment, calibration, scalar.scalar, names, grid=request.anomalies, map_known=is_known,
+        lag=scalar.lag_s, lever=scalar.lever_m or (0.0, 0.0, 0.0),
+    )  # fmt: skip
     if fit.doubt:
         _refuse(request, fit.doubt)
         cli.complain(fit.doubt)
@@ -425,14 +386,10 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
     source = deployment.attrs["source"]
     placed = {"latitude", "longitude"} <= set(deployment.data_vars) and not counts_from_boot(deployment)
     if placed or "reference_field" in deployment:
-        raise WrongUse(
-            f"--reference mean: {source} has positions or reference_field already; leave the option out"
-        )
+        raise WrongUse(f"--reference mean: {source} has positions or reference_field; leave the option out")
     deployment = about_mean(deployment)
     mean = float(deployment["reference_field"][0])
-    cli.complain(
-        f"{source}: the Earth's field is not known; the reference is the mean reading, {mean:.0f} nT"
-    )
+    cli.complain(f"{source}: the Earth's field is unknown; the reference is the mean reading, {mean:.0f} nT")
     return deployment, GAIN_SIGMA * mean if site_bias is None else site_bias
 
 
@@ -455,9 +412,7 @@ def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
         except DataError as error:
             cli.complain(f"compass {number}: {error}")
     if not results:
-        raise DataError(
-            f"{request.files[0]}: none of its {len(numbers)} compasses could be calibrated; see above"
-        )
+        raise DataError(f"{request.files[0]}: none of {len(numbers)} compasses can be calibrated; see above")
     return results
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
-from cyclopts import App, Parameter, Token
+from cyclopts import App, Parameter, Token, validators
 
 import magbridge as mb
+from magbridge.calibration.fitting import FIT_RANGES
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, DataError, FormatError, OutOfRange, WrongUse
 from magbridge.files import existing
@@ -72,10 +73,7 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
 
 
 def folder_to_write(_: Any, path: Any) -> None:
-    """Check that a folder to write to can be created or written.
-
-    ValueError: it cannot.
-    """
+    """Check that a folder to write to can be created or written; ValueError: it cannot."""
     if path is None:
         return
     there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
@@ -102,6 +100,7 @@ def _day(_: Any, tokens: Sequence[Token]) -> dt.date:
 
 
 Day = Annotated[dt.date | None, Parameter(converter=_day)]
+Whole = Annotated[int, Parameter(converter=_whole_number)]
 
 
 @Parameter(name="*")
@@ -176,10 +175,7 @@ class ScalarOptions:
     lever: str = ""
 
     def check(self, *, is_reference: bool = False) -> None:
-        """Check the options.
-
-        WrongUse: lag or lever arm are not numbers, or an option needs --scalar.
-        """
+        """Check the options; WrongUse: lag or lever arm are not numbers, or an option needs --scalar."""
         if not self.scalar and (is_reference or self.lag != "auto" or self.lever):
             raise WrongUse("--reference scalar, --lag, --lever: expected --scalar COLUMN with them; add it")
         try:
@@ -206,6 +202,50 @@ class ScalarOptions:
         return forward, starboard, down
 
 
+def fit_range(option: str) -> validators.Number:
+    """Return a validator of an option of the fit."""
+    low, high = FIT_RANGES[option]
+    return validators.Number(gte=low, lte=high)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FitOptions:
+    """Options for the fit of a calibration.
+
+    Parameters
+    ----------
+    parameter
+        A column with the position of a moving mass, or a current; may be repeated. auto: the columns of the
+        log that improve the prediction of held-out parts.
+    order
+        Highest total degree of the polynomials in the parameters.
+    position_sigma
+        1-sigma in m of the slow drift of dead-reckoned positions, if the crustal field is estimated; 0:
+        positions are exact.
+    base
+        A base station's log (total_field, or a vector), whose variation is subtracted. A log of an
+        observatory (IAGA-2002) among the logs is used in the same way.
+    """
+
+    parameter: tuple[str, ...] = ()
+    order: Annotated[Whole, Parameter(validator=fit_range("order"))] = 3
+    position_sigma: Annotated[float, Parameter(validator=fit_range("position_sigma"))] = 0.0
+    base: Annotated[Path | None, Parameter(name=["--base-station", "--base"])] = None
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Names of the given parameters, without ``auto``."""
+        return tuple(name for name in self.parameter if name != "auto")
+
+    @property
+    def drift(self) -> dict[str, Any]:
+        """Option ``position_sigma`` of the fit if positions drift; else empty."""
+        return {"position_sigma": self.position_sigma} if self.position_sigma else {}
+
+
+NO_PARAMETERS = FitOptions()
+"""Default: a fit without parameters."""
 AS_THEY_SAY = ReadingOptions()
 """Default: logs are read as their own headers declare."""
 NO_SCALAR = ScalarOptions()
@@ -215,8 +255,8 @@ CalibrationOutput = Annotated[Path, Parameter(name=["--output", "-o"], validator
 SavedCalibration = Annotated[Path | None, Parameter(validator=file_to_write(".json"))]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(*suffixes(write=True)))]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
+FolderOutput = Annotated[Folder, Parameter(name=["--output", "-o"])]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
-Base = Annotated[Path | None, Parameter(name=["--base-station", "--base"])]
 Heading = Annotated[
     Literal["true", "magnetic", "inertial"] | None,
     Parameter(
@@ -225,20 +265,16 @@ Heading = Annotated[
     ),
 ]
 Plot = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
-Whole = Annotated[int, Parameter(converter=_whole_number)]
 Json = Annotated[bool, Parameter(help="Print the result, or the error, as one JSON object.")]
 
 
-def check_inputs(
-    files: tuple[Path, ...], output: Path | None = None, *others: Path | None
-) -> tuple[Path, ...]:
-    """Return `files`; WrongUse: `files` is empty, or `output` is one of `files` or `others`."""
+def check_inputs(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> None:
+    """Check the paths of a command; WrongUse: `files` is empty, or `output` is one of `files` or `others`."""
     if not files:
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]
     if output is not None and os.path.realpath(output) in read:
         raise WrongUse(f"{output}: is one of the files to read; choose another file to write")
-    return files
 
 
 def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> None:
@@ -248,7 +284,8 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
 
     WrongUse: as :func:`check_inputs`. FormatError: a file does not exist, or a log is empty.
     """
-    for path in check_inputs(files, output, *others):
+    check_inputs(files, output, *others)
+    for path in files:
         if not is_bag(path) and not existing(path).stat().st_size:
             raise FormatError(path, "expected a log, got an empty file")
     for other in others:
@@ -410,9 +447,7 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
     if AUTO not in named:
         return tuple(named)
     if len(named) > 1:
-        raise WrongUse(
-            f"--parameter {AUTO}: expected no other --parameter, because {AUTO} chooses among all columns"
-        )
+        raise WrongUse(f"--parameter {AUTO}: expected it alone, because {AUTO} chooses among all columns")
     offered = [*movers(deployment), *conditions(deployment)]
     taken, offers = best_parameters(deployment, offered, **options)
     none = f"--parameter {AUTO}: none of {' '.join(offered) or 'its columns'} moves the field"

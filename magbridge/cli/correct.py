@@ -70,10 +70,9 @@ def correct(
     plot
         A PNG, PDF or SVG to write, with the corrected field, its 2-sigma band, and the flagged samples.
     """
-    if config is not None and not learn:
-        raise WrongUse(
-            "--config: expected --learn with it, because only learning uses a bridge.toml; add --learn"
-        )
+    for option, given in (("--config", config), ("--save", save)):
+        if given is not None and not learn:
+            raise WrongUse(f"{option}: expected --learn with it, because only learning uses it; add --learn")
     source = calibration or config
     if source is None:
         raise WrongUse("expected --calibration cal.json, or --learn with --config bridge.toml")
@@ -84,18 +83,14 @@ def correct(
 
     known, settings = _known(calibration, config)
     cli.complain_all(cli.warnings_of(known, source))
-    if save is not None and not learn:
-        raise WrongUse(
-            "--save: expected --learn with it, because it writes the learned calibration; add --learn"
-        )
     correction: mb.Correction | None = None
     pieces: list[dict[str, Any]] = []
     kept: list[xr.Dataset] = []
     rows = 0
     with Writer(output) as writer:
         parts = track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting")
-        given = files, known, source, settings if learn else None
-        for part, corrected, correction in _scalar_too(_corrected(parts, *given), known):
+        done = _corrected(parts, files, known, source, settings if learn else None)
+        for part, corrected, correction in _scalar_too(done, known):
             writer.append(corrected)
             _notify(correction)
             pieces.append(part.attrs)
@@ -177,7 +172,7 @@ def _corrected(
         if not lack and (lack := missing_anomaly(part)):
             cli.complain(f"{part.attrs['source']}: {lack}")
         sampled = part[list(CHANNELS)].to_array().notnull()
-        corrected = _with_log_columns(part, correct_rows(correction, part), known, file)
+        corrected = _with_columns(part, correct_rows(correction, part), known, file)
         yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
         whole = whole or bool(sampled.all("variable").any())
     if not whole:
@@ -190,9 +185,7 @@ def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learne
     """Return a learner with the bridge's settings; without ``[telemetry]`` it uses the log's currents."""
     from magbridge.bridge.learning import open_learner
 
-    currents = tuple(
-        str(name) for name in log.data_vars if usual(str(log[name].attrs.get("units", ""))) == "A"
-    )
+    currents = tuple(str(key) for key in log.data_vars if usual(str(log[key].attrs.get("units", ""))) == "A")
     learner = open_learner(settings, known, None if settings.telemetry else currents)
     assert learner is not None
     return learner
@@ -223,9 +216,7 @@ def _keep_learned(learner: Learner, known: mb.Calibration, facts: dict[str, Any]
     return f"; {state.learned_samples} learned from, calibration {name} at last"
 
 
-def _with_log_columns(
-    log: xr.Dataset, corrected: xr.Dataset, known: mb.Calibration, file: Path
-) -> xr.Dataset:
+def _with_columns(log: xr.Dataset, corrected: xr.Dataset, known: mb.Calibration, file: Path) -> xr.Dataset:
     """Return the corrected columns with the copied columns and attributes of the log."""
     from magbridge.calibration.file import calibration_id
     from magbridge.logs.deployment import HISTORY_ATTRIBUTE, MEANING, lasting
@@ -334,9 +325,7 @@ def export(
         For --seaglider: inclination of the Earth's field in deg, for the reported heading error.
     """
     if not any((c, ardupilot, px4, seaglider, table)):
-        raise WrongUse(
-            "expected --c DIR, --ardupilot F.param, --px4 F.params, --seaglider F.cal or --table F.csv"
-        )
+        raise WrongUse("expected a file: --c DIR, --ardupilot F, --px4 F, --seaglider F or --table F")
 
     from magbridge.calibration.export_compass import position_table
     from magbridge.errors import CalibrationError

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 import magbridge as mb
 from magbridge.cli import common as cli
@@ -30,7 +28,7 @@ ITSELF = (
 def diagnose(
     *files: Path,
     calibration: Path,
-    output: Annotated[cli.Folder, Parameter(name=["--output", "-o"])],
+    output: cli.FolderOutput,
     training_logs: tuple[Path, ...] = (),
     grid: Path | None = None,
     reading: cli.ReadingOptions = cli.AS_THEY_SAY,

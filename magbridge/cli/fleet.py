@@ -72,9 +72,7 @@ def add(
         raise WrongUse("expected FILE (a fleet.toml or logs), or --vehicle NAME with its --parameter")
     described, made, logs = _sorted(files)
     if (logs or made) and not (vehicle and deployment):
-        raise WrongUse(
-            "logs: expected --vehicle and --deployment with them; add these, or list the logs in a fleet.toml"
-        )
+        raise WrongUse("logs: expected --vehicle and --deployment with them, or a fleet.toml that lists them")
     if logs:
         cli.logs_to_read(tuple(logs))
     if made and date is None:
@@ -167,14 +165,10 @@ def process(
         with waiting("learning"):
             remember(there)
     result = {"deployments": len(every), "processed": len(todo), "failures": failures}
-    text = (
-        f"{counted(len(every), 'deployment')}, {len(todo)} of them new; {counted(len(failures), 'failure')}"
-    )
+    text = f"{counted(len(every), 'deployment')}, {len(todo)} new; {counted(len(failures), 'failure')}"
     cli.print_result(result, f"{there.name}: {text}", json)
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
-        raise cli.FailedResult(
-            f"{there.name}: none of {len(todo)} deployments could be calibrated; see the lines above"
-        )
+        raise cli.FailedResult(f"{there.name}: none of {len(todo)} deployments can be calibrated; see above")
 
 
 @fleet.command

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter, validators
 
@@ -31,29 +32,15 @@ class CorrectionOptions:
 
     Parameters
     ----------
-    parameter
-        A column with the position of a moving mass, or a current; may be repeated. auto: the columns of the
-        log that improve the prediction of held-out parts.
-    order
-        Highest total degree of the polynomials in the parameters.
     calibration
         A calibration (cal.json) to use instead of fitting one; may be repeated, once for each raw log in
         order.
     save
         A file (cal.json) for the fitted calibration.
-    position_sigma
-        1-sigma in m of the slow drift of dead-reckoned positions; 0: positions are exact.
-    base
-        A base station's log (total_field, or a vector), whose variation is subtracted. A log of an
-        observatory (IAGA-2002) among the logs is used in the same way.
     """
 
-    parameter: tuple[str, ...] = ()
-    order: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
     calibration: tuple[Path, ...] = ()
     save: cli.SavedCalibration = None
-    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
-    base: cli.Base = None
 
 
 @Parameter(name="*")
@@ -98,6 +85,7 @@ MAP_ONLY = MapOptions()
 def survey(
     *logs: Path,
     output: cli.Output,
+    fit: cli.FitOptions = cli.NO_PARAMETERS,
     correction: CorrectionOptions = SELF_CALIBRATED,
     scalar: cli.ScalarOptions = cli.NO_SCALAR,
     products: MapOptions = MAP_ONLY,
@@ -123,7 +111,7 @@ def survey(
     from magbridge.survey.run import facts, summary
     from magbridge.survey.run import survey as make
 
-    cli.logs_to_read(logs, output, correction.base, products.predict, *correction.calibration)
+    cli.logs_to_read(logs, output, fit.base, products.predict, *correction.calibration)
     if products.predict is None and output.suffix.lower() != ".nc":
         raise WrongUse(f"{output}: expected a map's name that ends in .nc")
     if (correction.calibration or scalar.scalar) and correction.save:
@@ -131,9 +119,9 @@ def survey(
     scalar.check()
     with waiting("surveying"):
         if scalar.scalar:
-            done = _scalar_survey(logs, scalar, correction, reading)
+            done = _scalar_survey(logs, scalar, fit, correction.calibration, reading)
         else:
-            done = make(_samples(logs, correction, reading))
+            done = make(_samples(logs, fit, correction, reading))
     cli.complain_all(done.warnings)
     if products.predict:
         _predict(done, products.predict, output)
@@ -149,7 +137,8 @@ def survey(
 def _scalar_survey(
     files: tuple[Path, ...],
     scalar: cli.ScalarOptions,
-    correction: CorrectionOptions,
+    fit: cli.FitOptions,
+    calibrations: tuple[Path, ...],
     reading: cli.ReadingOptions,
 ) -> Result:
     """Return the survey result from the column of a scalar magnetometer."""
@@ -159,23 +148,25 @@ def _scalar_survey(
     from magbridge.survey.run import scalar_survey
 
     column = scalar.scalar
-    logs = cli.by_base_station(read_each(list(files), options=reading.options), correction.base)
+    logs = cli.by_base_station(read_each(list(files), options=reading.options), fit.base)
     logs = [with_true_heading(log) for log in logs]
     cli.note_losses(*(log.attrs for log in logs))
-    known = [mb.load(path) for path in correction.calibration]
-    for path, found in zip(correction.calibration, known, strict=True):
+    known = [mb.load(path) for path in calibrations]
+    for path, found in zip(calibrations, known, strict=True):
         if all(sensor.column != column for sensor in found.sensors):
             cli.complain(
                 f"{path}: expected a scalar sensor {column!r}, got none: it is not compensated; fit with "
                 f"magbridge calibrate --scalar {column}"
             )
-    names = [name for name in correction.parameter if name != "auto"]
-    if "auto" in correction.parameter:
+    names: Sequence[str] = fit.named
+    if "auto" in fit.parameter:
         names = sorted({name for log in logs for name in telemetry_columns(log, column)})
     return scalar_survey(logs, column, names, known, lag=scalar.lag_s, lever=scalar.lever_m)
 
 
-def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cli.ReadingOptions) -> Samples:
+def _samples(
+    files: tuple[Path, ...], fit: cli.FitOptions, correction: CorrectionOptions, reading: cli.ReadingOptions
+) -> Samples:
     """Return the samples of all files, corrected; raw logs without a calibration are calibrated first."""
     from magbridge.columns import CHANNELS
     from magbridge.field.reference import placed
@@ -188,7 +179,7 @@ def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cl
     parts = [read_table(path) for path in tables]
     if not others:
         return joined(parts)
-    deployments = cli.by_base_station(read_each(others, options=reading.options), correction.base)
+    deployments = cli.by_base_station(read_each(others, options=reading.options), fit.base)
     cli.note_losses(*(one.attrs for one in deployments))
     raw = [one for one in deployments if all(name in one for name in CHANNELS)]
     known = [mb.load(path) for path in correction.calibration]
@@ -198,23 +189,20 @@ def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cl
     for path, one in zip(correction.calibration, known, strict=True):
         cli.complain_all(cli.warnings_of(one, path))
     if raw and not known:
-        found = _calibrated(raw, correction, strict=reading.strict)
+        found = _calibrated(raw, fit, correction.save, strict=reading.strict)
         known = [found.calibration if found.creep is None else found.creep.calibration]
         deployments = [without_creep(one, found.creep) for one in deployments]
     return joined([*parts, samples_of(deployments, known)])
 
 
-def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict: bool) -> Fit:
+def _calibrated(logs: list[xr.Dataset], fit: cli.FitOptions, save: Path | None, *, strict: bool) -> Fit:
     """Return the fit of a calibration to the raw logs of the survey; write the calibration if requested."""
     from magbridge.calibration.fitting.observe import observations
     from magbridge.columns import require
     from magbridge.logs.deployment import join
 
-    together, order = join(logs), correction.order
-    options: dict[str, Any] = {}
-    if correction.position_sigma:
-        options["position_sigma"] = correction.position_sigma
-    parameters = cli.chosen_parameters(correction.parameter, together, order=order, **options)
+    together, order, options = join(logs), fit.order, fit.drift
+    parameters = cli.chosen_parameters(fit.parameter, together, order=order, **options)
     require(together, parameters)
     with cli.naming(together):
         data = observations(together, parameters)
@@ -228,8 +216,8 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
             f"{together.attrs['source']}: the survey does not support a calibration, for the reasons "
             "above; leave --strict out to use it all the same"
         )
-    if correction.save:
-        mb.save(found.calibration, correction.save)
+    if save:
+        mb.save(found.calibration, save)
     return found
 
 
