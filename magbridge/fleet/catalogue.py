@@ -215,9 +215,7 @@ class FolderCatalogue(Catalogue):
             try:
                 part = pl.read_parquet(path, columns=list(schema))
             except pl.exceptions.PolarsError as error:
-                raise FormatError(
-                    path, f"expected a Parquet file of the catalogue, got a damaged one: {error}"
-                ) from error
+                raise FormatError(path, f"expected a Parquet file, got a damaged one: {error}") from error
             for name, kind in schema.items():
                 if part.schema[name] != kind:
                     expected = f"expected a column of {kind}, got {part.schema[name]}"

@@ -65,9 +65,7 @@ def shapes_of(
     size, order = len(mean), max(map(sum, exponents))
     shapes = np.zeros((len(exponents), 9, len(mounted), 3 * SHAPE_KINDS))
     latents = z[size:].reshape(-1, LATENT), family.widths(family.centre)[size:].reshape(-1, LATENT)
-    for i, (name, mass, latent, width) in enumerate(
-        zip(mounted.keys(), mounted.values(), *latents, strict=True)
-    ):
+    for i, ((name, mass), latent, width) in enumerate(zip(mounted.items(), *latents, strict=True)):
         k = [one.name for one in parameters].index(name)
         by = mass_columns(np.array(mass.at), np.array(mass.travel), parameters[k], order, latent) * width
         for n in range(order + 1):
@@ -165,9 +163,8 @@ class Fleet:
         for k, lesson in enumerate(self.lessons):
             if lesson.vehicle == vehicle and lesson.time < before_time:
                 seen = self.observed[k]
-                past.append(
-                    replace(seen, refit=f"{CHANGED_PREFIX}{seen.refit}") if k in self.changed else seen
-                )
+                changed = k in self.changed
+                past.append(replace(seen, refit=f"{CHANGED_PREFIX}{seen.refit}") if changed else seen)
         if past and past[-1].refit == f"{CHANGED_PREFIX}{refit}":  # the vehicle has not changed back
             refit = past[-1].refit
         return self.predicted(past, vehicle, refit)
@@ -201,9 +198,7 @@ def learn_fleet(
     DataError: `lessons` is empty.
     """
     if not lessons:
-        raise DataError(
-            "no deployment of a vehicle with these masses has been calibrated; run magbridge fleet process"
-        )
+        raise DataError("no deployment with these masses has been calibrated; run magbridge fleet process")
     lessons = sorted(lessons, key=lambda one: (one.time, one.vehicle, one.deployment))
     exponents = lessons[0].exponents
     parameters = _whole_range(lessons)

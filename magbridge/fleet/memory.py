@@ -74,9 +74,7 @@ def fleet_of(catalogue: Catalogue, vehicle: str, excluded: Collection[str] = ())
     units = {tuple(one.unit for one in lesson.parameters) for lesson in found}
     if len(units) > 1:
         both = " and ".join(", ".join(one) for one in sorted(units))
-        raise DataError(
-            f"{catalogue.name}: expected one unit for each parameter of {vehicle}'s fleet, got {both}"
-        )
+        raise DataError(f"{catalogue.name}: expected one unit per parameter of {vehicle}'s fleet, got {both}")
     mounted = {name: masses(row) for name, row in vehicles(catalogue).items()}
     of = _name(found, mounted)
     stored = {
@@ -215,9 +213,7 @@ def add_calibration(
         if one["job"] == GIVEN and (one["vehicle"], one["deployment"]) == (vehicle, deployment.name)
     ]
     if any(one["calibration"] != row["calibration"] for one in before):
-        raise WrongUse(
-            f"{vehicle} {deployment.name}: has another calibration already; name another deployment"
-        )
+        raise WrongUse(f"{vehicle} {deployment.name}: has another calibration; name another deployment")
     return catalogue.add("calibrations", [row])
 
 
@@ -281,7 +277,6 @@ class FleetPrediction(NamedTuple):
 
     known: Known
     vehicle: str
-    refit: str
     own: int
     others: int
 
@@ -306,7 +301,7 @@ def start(location: str | Path, member: str, refit: str, digests: Collection[str
         refit = refit or on_record
     fleet = fleet_of(catalogue, member, excluded=digests)
     own = sum(one.vehicle == member for one in fleet.lessons)
-    return FleetPrediction(fleet.known(member, refit), member, refit, own, len(fleet.lessons) - own)
+    return FleetPrediction(fleet.known(member, refit), member, own, len(fleet.lessons) - own)
 
 
 def gained(found: Fit, single: Fit | None, began: FleetPrediction) -> tuple[dict[str, Any], list[str]]:

@@ -55,9 +55,7 @@ def write_pages(
     is_single = path.suffix == ".html"
     for name in histories:
         if not (is_single or is_file_name(name)):
-            raise WriteError(
-                path, f"vehicle {name!r}: expected a name without slashes, not beginning with a dot"
-            )
+            raise WriteError(path, f"vehicle {name!r}: expected a name without slashes or leading dot")
     vehicles = []
     for name, one in histories.items():
         shown = _shown(name, one, findings.get(name, ()), (maps or {}).get(name))
@@ -78,9 +76,8 @@ def _write(
     path: Path, title: str, listed: Sequence[dict[str, Any]], detailed: Sequence[dict[str, Any]]
 ) -> None:
     """Write a page with a list of the vehicles `listed` and the details of the vehicles `detailed`."""
-    engine = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
-    )
+    loader = FileSystemLoader(Path(__file__).parent)
+    engine = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     text = engine.get_template("page.html").render(
         title=title, vehicles=listed, detailed=detailed, alarm=FALSE_ALARM_PROBABILITY,
         is_overview=bool(listed), heading="h2" if listed else "h1",

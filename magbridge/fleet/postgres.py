@@ -18,7 +18,6 @@ from psycopg.rows import dict_row
 from magbridge.errors import FormatError, PortError
 from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, COLUMN_TYPES, Catalogue, Row
 
-SCHEMA = sql.Identifier("magbridge_fleet")
 CONNECT_TIMEOUT_S = 10
 """Longest time to wait for a connection to the server, s."""
 CREATION_LOCK = 0x6D616762
@@ -43,21 +42,14 @@ class PostgresCatalogue(Catalogue):
         self._check_format(found[0] if found else 0)
 
     def _rows(self, table: str, columns: Sequence[str]) -> list[Row]:
-        query = sql.SQL('select {} from {}.{} order by key collate "C"').format(
-            sql.SQL(", ").join(map(sql.Identifier, columns)),
-            SCHEMA,
-            sql.Identifier(table),
+        query = sql.SQL('select {} from magbridge_fleet.{} order by key collate "C"').format(
+            sql.SQL(", ").join(map(sql.Identifier, columns)), sql.Identifier(table)
         )
-        try:
-            with (
-                self._connected() as connection,
-                connection.cursor(row_factory=dict_row, binary=True) as cursor,
-            ):
+        with self._connected() as connection, connection.cursor(row_factory=dict_row, binary=True) as cursor:
+            try:
                 return cursor.execute(query).fetchall()
-        except PortError as error:
-            if isinstance(error.__cause__, psycopg.errors.UndefinedTable):  # the catalogue is older
+            except psycopg.errors.UndefinedTable:  # the catalogue is older
                 return []
-            raise
 
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
         with self._connected() as connection:
@@ -65,8 +57,9 @@ class PostgresCatalogue(Catalogue):
             if known is None or known[0] is None:
                 self._make(connection)
         names = ("key", *CATALOGUE_TABLES[table])
-        query = sql.SQL("insert into {}.{} ({}) values ({}) on conflict (key) do nothing").format(
-            SCHEMA,
+        query = sql.SQL(
+            "insert into magbridge_fleet.{} ({}) values ({}) on conflict (key) do nothing"
+        ).format(
             sql.Identifier(table),
             sql.SQL(", ").join(map(sql.Identifier, names)),
             sql.SQL(", ").join(map(sql.Placeholder, names)),
@@ -77,10 +70,7 @@ class PostgresCatalogue(Catalogue):
 
     @contextmanager
     def _connected(self) -> Iterator[psycopg.Connection]:
-        """Yield a connection for one transaction.
-
-        PortError: the database reports an error.
-        """
+        """Yield a connection for one transaction; PortError: the database reports an error."""
         try:
             with psycopg.connect(self._url, connect_timeout=CONNECT_TIMEOUT_S) as connection:
                 yield connection
@@ -90,23 +80,15 @@ class PostgresCatalogue(Catalogue):
     def _make(self, connection: psycopg.Connection) -> None:
         """Create the schema and the missing tables while holding the creation lock."""
         connection.execute("select pg_advisory_xact_lock(%s)", (CREATION_LOCK,))
-        connection.execute(sql.SQL("create schema if not exists {}").format(SCHEMA))
-        connection.execute(
-            sql.SQL("create table if not exists {}.catalogue (format bigint primary key)").format(SCHEMA)
-        )
-        connection.execute(
-            sql.SQL(
-                "insert into {0}.catalogue select %s where not exists (select from {0}.catalogue)"
-            ).format(SCHEMA),
-            (CATALOGUE_FORMAT,),
-        )
+        connection.execute("create schema if not exists magbridge_fleet")
+        connection.execute("create table if not exists magbridge_fleet.catalogue (format bigint primary key)")
+        known = "select from magbridge_fleet.catalogue"
+        once = f"insert into magbridge_fleet.catalogue select %s where not exists ({known})"
+        connection.execute(once, (CATALOGUE_FORMAT,))
         for table, columns in CATALOGUE_TABLES.items():
             typed = [
                 sql.SQL("{} {}").format(sql.Identifier(name), sql.SQL(COLUMN_TYPES[kind][1]))
                 for name, kind in columns.items()
             ]
-            connection.execute(
-                sql.SQL("create table if not exists {}.{} (key text primary key, {})").format(
-                    SCHEMA, sql.Identifier(table), sql.SQL(", ").join(typed)
-                )
-            )
+            create = sql.SQL("create table if not exists magbridge_fleet.{} (key text primary key, {})")
+            connection.execute(create.format(sql.Identifier(table), sql.SQL(", ").join(typed)))

@@ -36,8 +36,8 @@ from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.learn import packed
 from magbridge.fleet.register import Job
 from magbridge.logs import Writer, read
-from magbridge.logs.deployment import join, passed_over, sliced
-from magbridge.logs.info import INFO_GAP_INTERVALS
+from magbridge.logs.deployment import join, sliced
+from magbridge.logs.info import info
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 from magbridge.survey.maps import anomaly_map
@@ -110,36 +110,28 @@ def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
 
 
 def _checked(path: Path, job: Job) -> xr.Dataset:
-    """Read a log.
-
-    FormatError: the log has no date, or is of another sensor than the job's.
-    """
+    """Read a log; FormatError: the log has no date, or is of another sensor than the job's."""
     log = read(path, required=CHANNELS)
     if counts_from_boot(log):
         first = str(np.datetime64(int(log["time"][0]), "s"))
-        raise FormatError(
-            path, f"expected times of a known day, got {first}; give it one with magbridge convert --date"
-        )
+        raise FormatError(path, f"expected a date, got {first}; give it one with magbridge convert --date")
     sensor, expected = str(log.attrs.get("sensor", "")), job.sensor
     if "" not in (sensor, expected) and sensor != expected:
-        raise FormatError(
-            path, f"expected a log of sensor {expected!r}, which {_named(job)} carries, got {sensor!r}"
-        )
+        wanted = f"expected a log of sensor {expected!r}, which {_named(job)} carries"
+        raise FormatError(path, f"{wanted}, got {sensor!r}")
     return log
 
 
 def _log(log: xr.Dataset, sha: str) -> Row:
-    time = log["time"].to_numpy()
-    steps = np.diff(time)
+    facts = info(log)
     middle = {
         name: float(np.nanmedian(log[name])) if name in log and log[name].notnull().any() else None
         for name in ("latitude", "longitude")
     }
     return {
-        "sha256": sha, "start": float(time[0]), "end": float(time[-1]), "rows": len(time),
+        "sha256": sha, **{name: facts[name] for name in ("start", "end", "rows", "gaps")},
         "samples": int(log[list(CHANNELS)].to_array().notnull().all("variable").sum()),
-        "gaps": int((steps > INFO_GAP_INTERVALS * np.median(steps)).sum()) if len(steps) else 0,
-        "losses": sum(passed_over(log.attrs).values()), "sensor": str(log.attrs.get("sensor", "")), **middle,
+        "losses": sum(facts["skipped"].values()), "sensor": str(log.attrs.get("sensor", "")), **middle,
     }  # fmt: skip
 
 
@@ -170,10 +162,8 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
             good = ~doubtful & np.isfinite(sigma)
             samples, flagged = samples + len(sigma), flagged + int(doubtful.sum())
             variances += float((sigma[good] ** 2).sum())
-    return {
-        **job.mark, "samples": samples, "flagged": flagged,
-        "sigma": float(np.sqrt(variances / max(samples - flagged, 1))),
-    }  # fmt: skip
+    typical = float(np.sqrt(variances / max(samples - flagged, 1)))
+    return {**job.mark, "samples": samples, "flagged": flagged, "sigma": typical}
 
 
 def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list[Row], list[Row]]:
@@ -199,18 +189,13 @@ def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path)
     made = survey(samples_of(logs, [calibration]))
     grid = anomaly_map(made.gridded, made.samples, name=path.name)
     grid.save(path)
-    return {
-        **job.mark, "rms": float(np.sqrt(np.mean(made.residual**2))),
-        "sigma": float(np.nanmedian(grid.sigma)),
-    }  # fmt: skip
+    rms = float(np.sqrt(np.mean(made.residual**2)))
+    return {**job.mark, "rms": rms, "sigma": float(np.nanmedian(grid.sigma))}
 
 
 def _failure(job: Job, line: str) -> Row:
-    whole = line if line.startswith("/") else f"{_named(job)}: {line}"
-    return {
-        **job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment,
-        "line": " ".join(whole.split()),
-    }  # fmt: skip
+    whole = " ".join((line if line.startswith("/") else f"{_named(job)}: {line}").split())
+    return {**job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment, "line": whole}
 
 
 def _named(job: Job) -> str:
@@ -223,8 +208,6 @@ COMPACT_INTERVAL = 64
 """Number of processed deployments after which the catalogue merges its small files."""
 SCHEDULER_TIMEOUT = "20s"
 """Longest time to wait for a connection to a scheduler."""
-
-
 MIN_MEMORY = 100e6
 """Smallest memory of a worker, bytes; with less, none would start."""
 
@@ -253,13 +236,9 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
         with client:
             yield client
         return
+    timeouts = {"connect": WORKER_START_TIMEOUT, "tcp": WORKER_START_TIMEOUT}
     with (
-        dask.config.set(
-            {
-                "distributed.comm.timeouts.connect": WORKER_START_TIMEOUT,
-                "distributed.comm.timeouts.tcp": WORKER_START_TIMEOUT,
-            }
-        ),
+        dask.config.set({"distributed.comm.timeouts": timeouts}),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

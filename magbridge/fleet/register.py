@@ -84,10 +84,8 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
         last = found.get(row["vehicle"], row)
         if any(last[key] != row[key] for key in FIXED_KEYS):
             both = " and ".join(_described(one) for one in (last, row))
-            raise FormatError(
-                catalogue.name,
-                f"expected one vehicle {row['vehicle']!r}, got two: {both}; remove a row",
-            )
+            expected = f"expected one vehicle {row['vehicle']!r}, got two: {both}; remove a row"
+            raise FormatError(catalogue.name, expected)
         found[row["vehicle"]] = row
     return found
 
@@ -120,9 +118,7 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     """
     _check_name(name, "a vehicle")
     if vehicle.mass and (odd := sorted(vehicle.mass.keys() ^ set(vehicle.parameters))):
-        raise WrongUse(
-            f"{name}: mass: expected a place for each parameter or none; not so for {', '.join(odd)}"
-        )
+        raise WrongUse(f"{name}: mass: expected a place per parameter or none; not so for {', '.join(odd)}")
     row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
     row["parameters"] = list(vehicle.parameters)
     row["mass"] = msgspec.json.encode(vehicle.mass, order="sorted").decode()
@@ -284,10 +280,9 @@ def new_jobs(catalogue: Catalogue, every: list[Job], *, retry: bool = False) -> 
     todo = []
     for job in every:
         more = job.name in failed
-        wanted = (job.diagnose and (job.name, "diagnosed") not in has) or (
-            job.map and (job.name, "mapped") not in has
-        )
-        if more or wanted or job.name not in last:
+        wanted = {"diagnosed": job.diagnose, "mapped": job.map}
+        lacks = any(asked and (job.name, what) not in has for what, asked in wanted.items())
+        if more or lacks or job.name not in last:
             todo.append(replace(job, attempt=last.get(job.name, 1) + more))
     return todo
 
