@@ -15,7 +15,6 @@ from typing import Any
 
 from nicegui import ui
 
-from magbridge.errors import MissingExtra
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.monitor.history import TIERS, Point, Series, TrackPoint
 from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
@@ -123,29 +122,25 @@ class Background:
 def read_background(path: Path) -> Background:
     """Read the anomaly grid of a file and return it as a picture.
 
-    FormatError: the file is not a grid. MissingExtra: the analysis extra is not installed.
+    FormatError: the file is not a grid.
     """
-    try:
-        import numpy as np  # noqa: PLC0415 - most pages show no grid
-        from matplotlib.image import imsave  # noqa: PLC0415 - as above
+    import numpy as np  # noqa: PLC0415 - most pages show no grid
+    from matplotlib.image import imsave  # noqa: PLC0415 - as above
 
-        from magbridge.field.read import read_grid  # noqa: PLC0415 - as above
-    except ImportError as error:
-        raise MissingExtra(str(error.name), "analysis") from error
+    from magbridge.field.read import read_grid  # noqa: PLC0415 - as above
+
     grid = read_grid(path)
     every = max(1, -(-max(grid.anomaly.shape) // PIXELS))
     values = grid.anomaly[::-every, ::every]
     span = float(np.nanpercentile(np.abs(values), 98.0)) or 1.0
     held = BytesIO()
     imsave(held, np.ma.masked_invalid(values), vmin=-span, vmax=span, cmap="RdBu_r", format="png")
-    half_x, half_y = (0.5 * float(axis[1] - axis[0]) for axis in (grid.longitude, grid.latitude))
-    box = (
-        float(grid.longitude[0]) - half_x,
-        float(grid.latitude[0]) - half_y,
-        float(grid.longitude[-1]) + half_x,
-        float(grid.latitude[-1]) + half_y,
-    )
-    return Background(box, "data:image/png;base64," + base64.b64encode(held.getvalue()).decode(), span)
+    x, y = grid.longitude, grid.latitude
+    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
+    edges = np.add([x[0], y[0], x[-1], y[-1]], [-half_x, -half_y, half_x, half_y])
+    west, south, east, north = edges.tolist()
+    picture = "data:image/png;base64," + base64.b64encode(held.getvalue()).decode()
+    return Background((west, south, east, north), picture, span)
 
 
 def ellipse(place: TrackPoint) -> list[tuple[float, float]]:
@@ -182,9 +177,8 @@ def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, 
     south, north = min(y for _, y in points), max(y for _, y in points)
     middle_x, middle_y = 0.5 * (west + east), 0.5 * (south + north)
     per_latitude, per_longitude = metres_per_degree(max(-89.0, min(middle_y, 89.0)))
-    height = 1.1 * max(
-        (north - south) * per_latitude, (east - west) * per_longitude / ASPECT, MIN_MAP_WIDTH_M / ASPECT
-    )
+    width = max((east - west) * per_longitude, MIN_MAP_WIDTH_M)
+    height = 1.1 * max((north - south) * per_latitude, width / ASPECT)
     half_x, half_y = 0.5 * ASPECT * height / per_longitude, 0.5 * height / per_latitude
     return middle_x - half_x, middle_y - half_y, middle_x + half_x, middle_y + half_y
 
@@ -281,9 +275,7 @@ class TelemetryChart:
             self._drawn = now_s - MAX_CHART_INTERVAL_S
             with self._box:
                 if not names:
-                    nothing(
-                        "None heard: the link must also carry the autopilot's NAMED_VALUE_FLOAT, or MAG_RAW"
-                    )
+                    nothing("None heard: the link must carry the autopilot's NAMED_VALUE_FLOAT, or MAG_RAW")
                 self._curves = {}
                 for name in names:
                     with ui.column().classes("gap-0 w-full"):

@@ -57,9 +57,8 @@ class Series:
 
     def __init__(self) -> None:
         self.latest, self.added = float("nan"), 0
-        self._tiers = {
-            name: deque[Point](maxlen=round(window / width) + 1) for name, (window, width) in TIERS.items()
-        }
+        points = {name: round(window / width) + 1 for name, (window, width) in TIERS.items()}
+        self._tiers = {name: deque[Point](maxlen=count) for name, count in points.items()}
 
     def add(self, time: float, value: float, two_sigma: float = 0.0) -> None:
         """Add a value at `time` (s since 1970) with its 2-sigma; ignore invalid numbers and times.
@@ -68,10 +67,8 @@ class Series:
         """
         if not (isfinite(value + two_sigma) and 0.0 <= time < LAST_YEAR):
             return
-        value, two_sigma = (
-            max(-MAX_PLOTTED_VALUE, min(value, MAX_PLOTTED_VALUE)),
-            min(abs(two_sigma), MAX_PLOTTED_VALUE),
-        )
+        value = max(-MAX_PLOTTED_VALUE, min(value, MAX_PLOTTED_VALUE))
+        two_sigma = min(abs(two_sigma), MAX_PLOTTED_VALUE)
         self.latest, self.added = value, self.added + 1
         for name, tier in self._tiers.items():
             width = TIERS[name][1]

@@ -95,10 +95,7 @@ class StationLink:
         return self._signing.refused if self._signing else 0
 
     def start(self) -> None:
-        """Open the port and start the thread.
-
-        PortError: the port cannot be opened.
-        """
+        """Open the port and start the thread; PortError: the port cannot be opened."""
         self.port.open()
         Thread(target=self._listen, name="link", daemon=True).start()
 

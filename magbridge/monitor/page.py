@@ -7,6 +7,7 @@ import json
 import platform
 import time
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from importlib.resources import files
 from io import BytesIO, StringIO
@@ -54,22 +55,16 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
         "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
         "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
     }
+    texts = [(utc(one.time), one.severity, one.text) for one in state.texts]
+    alarms = [
+        (utc(one.since), utc(one.last), one.active, one.acknowledged, one.count, one.text)
+        for one in state.alarms
+    ]
+    parameters = [(name, repr(one.value), one.error) for name, one in sorted(state.parameters.items())]
     tables: dict[str, list[Sequence[Any]]] = {
-        "texts": [
-            ("time", "severity", "text"),
-            *((utc(received.time), received.severity, received.text) for received in state.texts),
-        ],
-        "alarms": [
-            ("since", "last", "active", "acknowledged", "count", "alarm"),
-            *(
-                (utc(one.since), utc(one.last), one.active, one.acknowledged, one.count, one.text)
-                for one in state.alarms
-            ),
-        ],
-        "parameters": [
-            ("name", "value", "error"),
-            *((name, repr(one.value), one.error) for name, one in sorted(state.parameters.items())),
-        ],
+        "texts": [("time", "severity", "text"), *texts],
+        "alarms": [("since", "last", "active", "acknowledged", "count", "alarm"), *alarms],
+        "parameters": [("name", "value", "error"), *parameters],
         "samples": [list(spec("MAG_FIELD").fields), *(list(sample.values()) for sample in state.samples)],
     }
     held = BytesIO()
@@ -118,9 +113,8 @@ class Page:
             ui.space()
             ui.button("Picture", on_click=self._snapshot, icon="photo_camera").props(BUTTON)
             ui.button("Report", on_click=self._report, icon="bug_report").props(BUTTON)
-            self._stream = (
-                ui.label().classes("text-sm px-3 py-1 rounded-full text-white").props("role=status")
-            )
+            self._stream = ui.label().classes("text-sm px-3 py-1 rounded-full text-white")
+            self._stream.props("role=status")
 
     def _choose(self, bridge: Bridge | None) -> None:
         """Show another bridge: build all panels of the page again."""
@@ -149,9 +143,8 @@ class Page:
                 self._telemetry = TelemetryChart()
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 texts = Panel("Messages, UTC", "texts")
-                texts.html.classes("max-h-60 overflow-auto").props(
-                    'tabindex=0 role=log aria-label="Messages"'
-                )
+                text = texts.html.classes("max-h-60 overflow-auto")
+                text.props('tabindex=0 role=log aria-label="Messages"')
                 parameters = ParameterPanel(self._station, state)
         self._panels = *field, flags, *status, *more, texts, parameters
 
@@ -167,7 +160,7 @@ class Page:
         states = self._station.fleet.states
         if self._bridge not in states and states:
             self._choose(next(iter(states)))
-        self._offer(list(states))
+        self._offer()
         state, moment = self._state, monotonic_s()
         self._show_stream(state, moment)
         for panel in self._panels:
@@ -178,22 +171,18 @@ class Page:
         self._telemetry.show(state, self._tier, moment)
         self._track.show(state)
 
-    def _offer(self, bridges: list[Bridge]) -> None:
+    def _offer(self) -> None:
         """Show a button for each of several bridges, with its number of unacknowledged alarms."""
-        states = self._station.fleet.states
-        unseen = [states[bridge].alarms.unseen for bridge in bridges]
-        if (
-            not self._changes.new("vehicles", (bridges, unseen, self._bridge), self._choice)
-            or len(bridges) < 2
-        ):
+        unseen = {bridge: state.alarms.unseen for bridge, state in self._station.fleet.states.items()}
+        is_new = self._changes.new("vehicles", (unseen, self._bridge), self._choice)
+        if not is_new or len(unseen) < 2:
             return
         with self._choice:
-            for bridge, count in zip(bridges, unseen, strict=True):
+            for bridge, count in unseen.items():
                 text = "{}.{}".format(*bridge) + (f" ({count})" if count else "")
-                button = ui.button(text, on_click=lambda _, bridge=bridge: self._switch(bridge)).props(BUTTON)
-                button.props["aria-label"] = "Vehicle {}, component {}".format(*bridge) + (
-                    f", {counted(count, 'alarm')}" if count else ""
-                )
+                button = ui.button(text, on_click=partial(self._switch, bridge)).props(BUTTON)
+                alarms = f", {counted(count, 'alarm')}" if count else ""
+                button.props["aria-label"] = "Vehicle {}, component {}".format(*bridge) + alarms
                 button.props["aria-pressed"] = "true" if bridge == self._bridge else "false"
                 if bridge == self._bridge:
                     button.classes("!bg-slate-600")

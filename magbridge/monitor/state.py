@@ -195,13 +195,11 @@ class BridgeState:
         self.field, self.sampled = message.fields, now_s
         for name in Quality(self.field["flags"]).names().split():
             self.flags[name] = self.flags.get(name, (now_s, now_s))[0], now_s
-        self.flags = {
-            name: times for name, times in self.flags.items() if now_s - times[1] <= FLAG_HOLD_TIME_S
-        }
+        oldest = now_s - FLAG_HOLD_TIME_S
+        self.flags = {name: times for name, times in self.flags.items() if times[1] >= oldest}
         self.samples.append(self.field)
-        self.total.add(
-            self.field["time_usec"] * 1e-6, self.field["total_field"], 2 * self.field["total_field_sigma"]
-        )
+        total, sigma = (self.field[name] for name in ("total_field", "total_field_sigma"))
+        self.total.add(self.field["time_usec"] * 1e-6, total, 2 * sigma)
 
     def _sensor(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
         if sensor := self._sensor_of(message):

@@ -131,16 +131,12 @@ def sensor_rows(state: BridgeState, now_s: float) -> dict[int, dict[str, tuple[s
         line = report("state", MAG_PORT_STATE.OK)
         is_late = _late(sensor.sampled, sensor.interval, now_s)
         text = "no samples" if is_late and line == MAG_PORT_STATE.OK else _word(MAG_PORT_STATE, line)
+        difference = " ".join(_number(value, "+.2f", 2.0 * sigma)).strip()
+        rate = _figure(report("sample_rate", nan), ".2f", "Hz")
         rows[sensor.number] = {
             "Total field": (" ".join(total).strip(), True),
-            f"Minus {first.label}": (
-                " ".join(_number(value, "+.2f", 2.0 * sigma)).strip(),
-                not abs(value) > DISAGREEMENT_SIGMA * sigma,
-            ),
-            "Line": (
-                f"{text}, {_figure(report('sample_rate', nan), '.2f', 'Hz')}",
-                line == MAG_PORT_STATE.OK and not is_late,
-            ),
+            f"Minus {first.label}": (difference, not abs(value) > DISAGREEMENT_SIGMA * sigma),
+            "Line": (f"{text}, {rate}", line == MAG_PORT_STATE.OK and not is_late),
             "Flags": (Quality(get("flags", 0)).names() or "none", True),
         }
     return rows
@@ -152,20 +148,17 @@ def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
     field = ({} if _late(state.sampled, state.interval, now_s) else state.field).get
     get = state.status.get
     sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
+    known = state.field.get("calibration_id")
+    calibration = "–" if known is None else f"{known:08x}" if known else "none"
+    is_fresh = "stale_telemetry" not in state.flags
     return {
         "Sensor": (_word(MAG_PORT_STATE, sensor), sensor == MAG_PORT_STATE.OK),
         "Autopilot": (_word(MAG_PORT_STATE, autopilot), autopilot == MAG_PORT_STATE.OK),
         "Log": (_word(MAG_LOG_STATE, log), log in (MAG_LOG_STATE.OFF, MAG_LOG_STATE.OK)),
         "Sample rate": (_figure(get("sample_rate", nan), ".2f", "Hz"), True),
         "Latency": (_figure(1e3 * field("latency", nan), ".1f", "ms"), True),
-        "Telemetry age": (
-            _figure(field("telemetry_age", nan), ".1f", "s"),
-            "stale_telemetry" not in state.flags,
-        ),
-        "Calibration": (
-            f"{state.field['calibration_id']:08x}".replace("0" * 8, "none") if state.field else "–",
-            True,
-        ),
+        "Telemetry age": (_figure(field("telemetry_age", nan), ".1f", "s"), is_fresh),
+        "Calibration": (calibration, True),
         "Uptime": (duration(get("uptime", 0)), True),
     }
 
@@ -173,11 +166,9 @@ def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
 def losses(state: BridgeState) -> dict[str, tuple[str, bool]]:
     """Return the losses of bridge and link: name of an item -> its text, and True if it is normal."""
     counts = {name: state.status.get(counter, 0) for name, counter in LOSS_TEXTS.items()}
+    missed = f"{_figure(state.lost)} of {_figure(state.lost + state.received)}"
     return {
-        "Messages lost on the link": (
-            f"{_figure(state.lost)} of {_figure(state.lost + state.received)}",
-            not state.lost,
-        ),
+        "Messages lost on the link": (missed, not state.lost),
         # skipped bytes are normal: the bridge may join a stream in the middle of a frame
         **{name: (_figure(count), not count or name.startswith("Bytes")) for name, count in counts.items()},
     }
@@ -189,15 +180,13 @@ def whereabouts(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]
     mode = get("state", 0)
     nn, ne, ee = (get(f"covariance_{axes}", nan) for axes in ("nn", "ne", "ee"))
     sigma = worse_axis(nn, ne, ee) if nn + ee > 0.0 else nan
-    innovation, variance = get("innovation", nan), get("innovation_variance", nan)
+    two_sigma = 2.0 * sqrt(max(get("innovation_variance", nan), 0.0))
+    innovation = " ".join(_number(get("innovation", nan), "+.1f", two_sigma))
     return {
         "State": (_word(MAG_NAVIGATION_STATE, mode), mode != MAG_NAVIGATION_STATE.LOST),
         "Position": (f"{get('lat', 0) * 1e-7:.5f}, {get('lon', 0) * 1e-7:.5f}", True),
         "1σ of the longer axis": (_figure(sigma, ".0f", "m"), True),
-        "Innovation ± 2σ": (
-            " ".join(_number(innovation, "+.1f", 2.0 * sqrt(max(variance, 0.0)))),
-            bool(get("accepted", 1)),
-        ),
+        "Innovation ± 2σ": (innovation, bool(get("accepted", 1))),
         "Bias ± 2σ": (" ".join(_number(get("bias", nan), "+.1f", 2.0 * get("bias_sigma", nan))), True),
         "Current": (_figure(hypot(get("current_north", nan), get("current_east", nan)), ".2f", "m/s"), True),
         "Last update": (f"{duration(now_s - state.navigated)} ago" if state.navigation else "–", True),
