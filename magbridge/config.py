@@ -239,9 +239,7 @@ class Learning(Table, frozen=True):
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges.items():
             if not -1e12 < low < high < 1e12:
-                raise ValueError(
-                    f"ranges.{name}: expected the lowest and the highest value, got {low:g} and {high:g}"
-                )
+                raise ValueError(f"ranges.{name}: expected lowest and highest, got {low:g} and {high:g}")
 
 
 class Log(Table, frozen=True):
@@ -342,16 +340,14 @@ def parse(table: dict[str, Any], path: Path) -> Config:
     tables = {f"sensor.{name}": one for name, one in named.items()} or {"sensor": table.get("sensor")}
     for key, one in tables.items():
         if isinstance(one, dict) and "name" in one:
-            raise ConfigError(
-                path, f"{key}.name", "unknown key; name the sensor in its table's head, [sensor.NAME]"
-            )
+            raise ConfigError(path, f"{key}.name", "unknown key; name the sensor in the head, [sensor.NAME]")
     if not named:
         config = convert(table, Config, path)
         sensors = [config.sensor]
     else:
         check_entries(table, "sensor", Sensor, path)
         sensors = [
-            convert({**one, "name": name}, Sensor, path, f"sensor.{name}.") for name, one in named.items()
+            convert({**one, "name": key}, Sensor, path, f"sensor.{key}.") for key, one in named.items()
         ]
         config = convert({**table, "sensor": next(iter(named.values()))}, Config, path)
     main, *others = _numbered(sensors, path)
@@ -395,14 +391,10 @@ def _numbered(sensors: list[Sensor], path: Path) -> list[Sensor]:
     ConfigError: there are too many sensors, ids or names are repeated, or no sensor has the id 0.
     """
     if len(sensors) > MAX_BRIDGE_SENSORS:
-        raise ConfigError(
-            path, "sensor", f"expected at most {MAX_BRIDGE_SENSORS} sensors, got {len(sensors)}"
-        )
+        raise ConfigError(path, "sensor", f"expected at most {MAX_BRIDGE_SENSORS} tables, got {len(sensors)}")
     names = [one.name for one in sensors]
     if len(set(names)) < len(names):
-        raise ConfigError(
-            path, "sensor", f"expected a different name for each sensor, got {', '.join(names)}"
-        )
+        raise ConfigError(path, "sensor", f"expected another name for each sensor, got {', '.join(names)}")
     ids = [one.id for one in sensors if one.id is not None]
     if len(set(ids)) < len(ids):
         raise ConfigError(path, "sensor", f"expected a different id for each sensor, got {ids}")

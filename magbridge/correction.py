@@ -80,9 +80,7 @@ class Correction:
             )
             for name in calibration.channels
         )
-        self._masses = [
-            index for index, one in enumerate(inputs) if one.is_mass and isfinite(one.high - one.low)
-        ]
+        self._masses = [k for k, one in enumerate(inputs) if one.is_mass and isfinite(one.high - one.low)]
         self.aligner = Aligner(inputs, settings or Align(), calibration.sensor.power_cycle)
         self.names = tuple(one.name for one in inputs)
         for name in learner.watched if learner is not None else ():
@@ -208,16 +206,9 @@ class Correction:
         self._was_moving, health.is_changing = is_moving, bool(sample.spans)
         reference = main_field, self.aligner.settings.reference_sigma
         variance = health.check(
-            sample.time_us,
-            reading.field,
-            vector,
-            total,
-            quality,
-            reference,
-            reading.temperature,
-            sample.age,
+            sample.time_us, reading.field, vector, total, quality, reference, reading.temperature, sample.age,
             lambda: self._sensitivity(sample),
-        )
+        )  # fmt: skip
         return variance, health.flags
 
     def _sensitivity(self, sample: Sample) -> Sensitivity:
@@ -317,8 +308,5 @@ class Correction:
         more = sample.sigma * sample.sigma
         for change in self.corrector.changes(sample.field, sample.values, sample.spans):
             more += 0.25 * change * change
-        if (
-            not more < MAX_MEASURED_NT * MAX_MEASURED_NT
-        ):  # also NaN, if a parameter has neither value nor range
-            more = inf
-        return more
+        # more is NaN if a parameter has neither value nor range
+        return more if more < MAX_MEASURED_NT * MAX_MEASURED_NT else inf

@@ -78,9 +78,7 @@ def in_standard_units(log: xr.Dataset) -> xr.Dataset:
             if time.dtype.kind == "M":
                 log.attrs.setdefault("time_reference", "utc")
         elif time.dtype.kind not in "iuf":
-            raise FormatError(
-                source, f"expected times as numbers or datetime64, got {time.dtype}", column=name
-            )
+            raise FormatError(source, f"expected numbers or datetime64, got {time.dtype}", column=name)
     for key, column in log.variables.items():
         name, unit = str(key), str(column.attrs.get("units", ""))
         if (scale := conversion(source, name, unit)) != 1.0:

@@ -37,9 +37,7 @@ class MagbridgeError(Exception):
         return _rebuilt, (type(self), self.args, self.__dict__)
 
 
-def _rebuilt(
-    kind: type[MagbridgeError], args: tuple[object, ...], values: dict[str, object]
-) -> MagbridgeError:
+def _rebuilt(kind: type[MagbridgeError], args: tuple[Any, ...], values: dict[str, Any]) -> MagbridgeError:
     """Rebuild an error from its pickled values."""
     error = kind.__new__(kind, *args)
     error.args = args

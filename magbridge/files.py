@@ -40,9 +40,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     except MagbridgeError:
         raise
     except OSError as error:
-        reason = (
-            os.strerror(error.errno) if error.errno else str(error)
-        )  # independent of the library that writes
+        reason = os.strerror(error.errno) if error.errno else str(error)  # not in the library's words
         raise WriteError(target, reason) from error
     finally:
         with suppress(OSError):  # it was renamed, or never created

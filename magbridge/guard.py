@@ -56,9 +56,8 @@ class GuardedJob(NamedTuple):
         """Allowed processor time (s) and memory (bytes), computed from the size of the file."""
         files = self.path.iterdir() if self.path.is_dir() else [self.path]  # a folder holds one log
         size = sum(file.stat().st_size for file in files if file.is_file())
-        return round(
-            BASE_TIME_S + TIME_S_PER_MB * size / 1e6
-        ), BASE_MEMORY_BYTES + MEMORY_PER_FILE_BYTE * size
+        memory = BASE_MEMORY_BYTES + MEMORY_PER_FILE_BYTE * size
+        return round(BASE_TIME_S + TIME_S_PER_MB * size / 1e6), memory
 
 
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
@@ -155,9 +154,8 @@ class _Child:
         while not self._pieces.poll(MEMORY_POLL_S):
             waited += MEMORY_POLL_S
             if waited > MAX_WAIT_RATIO * seconds:
-                raise FormatError(
-                    job.path, f"takes longer than {MAX_WAIT_RATIO * seconds:.0f} s to read: damaged"
-                )
+                most_s = MAX_WAIT_RATIO * seconds
+                raise FormatError(job.path, f"takes longer than {most_s:.0f} s to read: damaged")
             if _memory(self._process.pid)[1] > self._used + memory:
                 raise FormatError(job.path, TOO_LARGE)
         try:

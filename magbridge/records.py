@@ -12,16 +12,9 @@ from typing import Final
 import msgspec
 
 __all__ = [
-    "MAX_DEVICE_TIME_S",
-    "MAX_MEASURED_NT",
-    "NEVER",
-    "NULL_POSITION_DEG",
-    "Channel",
-    "Corrected",
-    "Quality",
-    "Reading",
-    "Vector",
-]
+    "MAX_DEVICE_TIME_S", "MAX_MEASURED_NT", "NEVER", "NULL_POSITION_DEG", "Channel", "Corrected", "Quality",
+    "Reading", "Vector",
+]  # fmt: skip
 
 Vector = tuple[float, float, float]
 

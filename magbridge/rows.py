@@ -237,9 +237,8 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
 
     times = np.asarray(deployment["time"].to_numpy(), float)
     stamps = (np.rint(times * 1e6).astype(np.int64) & ~3).tolist()
-    delays = [
-        np.nan_to_num(_column(deployment, f"mag_time_{axis}") - times).round(6).tolist() for axis in "xyz"
-    ]
+    sampled = [_column(deployment, f"mag_time_{axis}") for axis in "xyz"]
+    delays = [np.nan_to_num(one - times).round(6).tolist() for one in sampled]
     wanted = [name for name in correction.aligner.by_name if name != TEMPERATURE]
     telemetry = [(name, column(name), column(AGE + name)) for name in wanted]
     following = [
@@ -261,11 +260,8 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
                 correction.telemetry(name, value, time_us)
         if field[0] == field[0] or field[1] == field[1] or field[2] == field[2]:  # not all NaN
             power_cycle = int(cycle) if isfinite(cycle) else None
-            yield (
-                row,
-                Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle),
-                stamp,
-            )
+            fields = Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle)
+            yield row, fields, stamp
         elif isfinite(temperature):  # of another log than the readings
             correction.telemetry(TEMPERATURE, temperature, stamp)
 

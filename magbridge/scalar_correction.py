@@ -56,9 +56,8 @@ class ScalarCorrection:
     def __init__(self, sensor: ScalarSensor | None, settings: Align, sigma: float | None = None) -> None:
         self._sensor = sensor.without_shift() if sensor is not None else None
         channels = sensor.channels if sensor is not None else ()
-        inputs = tuple(
-            Input(one.name, one.low, one.high, MAX_TELEMETRY_AGE_S, is_mass=False) for one in channels
-        )
+        age = MAX_TELEMETRY_AGE_S
+        inputs = tuple(Input(one.name, one.low, one.high, age, is_mass=False) for one in channels)
         self.aligner = Aligner(inputs, settings)
         self._messages = Messages()
         self.notices = self._messages.lines

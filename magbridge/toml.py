@@ -100,9 +100,8 @@ def _valid(kind: Any, keys: str) -> list[str]:
     """Return the valid keys of a table, or the listed values, at the dotted path `keys` in `kind`."""
     tables = [inspect.type_info(kind)]
     for key in [*filter(None, re.split(r"\.|(?=\[)", keys)), None]:
-        tables = [
-            part for one in tables for part in (one.types if isinstance(one, inspect.UnionType) else [one])
-        ]
+        unions = [one.types if isinstance(one, inspect.UnionType) else [one] for one in tables]
+        tables = [part for parts in unions for part in parts]
         if key is None:
             break
         tables = [inner for one in tables for inner in _entries(one, key)]
