@@ -60,10 +60,8 @@ def signals_are_heard() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Return the folder of measured data, which is outside the repository; skip the test if it is missing."""
-    for candidate in (
-        os.environ.get("MAGBRIDGE_REAL_DATA", ""),
-        Path(__file__).parents[2] / "shared" / "data",
-    ):
+    beside = Path(__file__).parents[2] / "shared" / "data"
+    for candidate in (os.environ.get("MAGBRIDGE_REAL_DATA", ""), beside):
         if candidate and Path(candidate).is_dir():
             return Path(candidate)
     pytest.skip("no measured data: set MAGBRIDGE_REAL_DATA or put them in ../shared/data")

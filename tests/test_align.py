@@ -27,27 +27,23 @@ def flags(sample: Sample) -> set[str]:
     return set(Quality(sample.quality).names().split())
 
 
-@given(st.tuples(*[st.floats(0, 2)] * 3), st.floats(-1e3, 1e3), st.floats(-50, 50), st.floats(0.0, 3.0))
+DELAY = st.tuples(*[st.floats(0, 2)] * 3)
+
+
+@given(DELAY, DELAY, st.floats(-1e3, 1e3), st.floats(-50, 50), st.floats(0.0, 3.0))
 def test_any_order_of_channels_and_any_filter_delay(
-    delays: tuple[float, float, float], level: float, slope: float, filter_delay: float
-) -> None:
+    first: tuple[float, float, float], delays: tuple[float, float, float], level: float, slope: float,
+    filter_delay: float,
+) -> None:  # fmt: skip
+    """The delays may differ from reading to reading, as of a converter that loses its beat."""
     aligner = Aligner((), Align(filter_delay=filter_delay))
-    for t in (0.0, 4.0):
-        field = tuple(level + slope * (t + delay) for delay in delays)
-        sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
+    for t, late in ((0.0, first), (4.0, delays)):
+        x, y, z = (level + slope * (t + delay) for delay in late)
+        sample = aligner.reading(Reading((x, y, z), channel_delay=late), START + round(t * SECOND))
     assert sample.time_us % 4 == 0  # the two low bits belong to the log
     expected = level + slope * (4.0 + min(delays))
     np.testing.assert_allclose(sample.field, expected, atol=1e-6)
     assert abs(sample.time_us - (START + (4.0 + min(delays) - filter_delay) * SECOND)) <= 5
-
-
-def test_delays_that_differ_from_reading_to_reading() -> None:
-    """A converter that loses its beat: the step between two readings of a channel is not the frames'."""
-    aligner = Aligner((), Align())
-    for t, delays in ((0.0, (0.0, 0.3, 0.9)), (4.0, (0.2, 0.8, 0.1))):
-        field = tuple(30.0 * (t + delay) for delay in delays)
-        sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
-    np.testing.assert_allclose(sample.field, 30.0 * 4.1, atol=1e-6)
 
 
 def test_telemetry_is_looked_up_at_the_sample_s_time() -> None:
@@ -228,19 +224,12 @@ def test_of_a_time_within_the_standstill_whose_telemetry_has_not_come_nothing_is
     assert flags(aligner.reading(reading(device_time=1.0), START + SECOND)) == {"late_join"}
 
 
-def test_gap_and_missing_readings() -> None:
+@pytest.mark.parametrize("times", [[0, 4, 8, 12, 24, 28], [0, 5, 10, 15, 45, 75, 105, 110, 115]])
+def test_missing_readings_are_a_gap_and_so_is_the_first_of_a_slower_rate(times: list[int]) -> None:
     aligner = Aligner((), Align())
-    times = [0, 4, 8, 12, 24, 28]
     gaps = ["gap" in flags(aligner.reading(reading(), START + t * SECOND)) for t in times]
-    assert gaps == [False, False, False, False, True, False]
-    assert "gap" in flags(aligner.reading(reading(missing=1), START + 32 * SECOND))
-
-
-def test_a_slower_sampling_rate_is_one_gap_and_then_the_new_period() -> None:
-    aligner = Aligner((), Align())
-    times = [0, 5, 10, 15, 45, 75, 105, 110, 115]
-    gaps = ["gap" in flags(aligner.reading(reading(), START + t * SECOND)) for t in times]
-    assert gaps == [False] * 4 + [True] + [False] * 4
+    assert gaps == [k == 4 for k in range(len(times))]
+    assert "gap" in flags(aligner.reading(reading(missing=1), START + (times[-1] + 4) * SECOND))
 
 
 def test_a_power_cycle_makes_the_offset_suspect_for_good() -> None:
@@ -270,26 +259,20 @@ def turning(rate: float, acceleration: float, at: list[float]) -> list[tuple[flo
     return [tuple(30_000.0 + rate * t + 0.5 * acceleration * t * t for t in np.add(s, DELAYS)) for s in at]
 
 
-def test_the_parabola_is_exact_where_the_field_turns_ever_faster() -> None:
-    channels, times = OneTime(), [3.0, 7.0, 12.0, 15.0]
+def test_the_parabola_is_exact_where_the_field_turns_ever_faster_and_sigma_is_the_lag_of_the_slopes() -> None:
+    """Steadily faster, a chord lies above the curve by d (h - d) / 2 of the acceleration."""
+    channels, times, d = OneTime(), [3.0, 7.0, 11.0, 14.0], np.array(DELAYS)
     for k, (t, field) in enumerate(zip(times, turning(20.0, 3.0, times), strict=True)):
-        channels.bring(field, DELAYS, round(t * SECOND))
+        out, _ = channels.bring(field, DELAYS, round(t * SECOND))
+        truth = [30_000.0 + 20.0 * at + 1.5 * at**2 for at in times]
         if k < 2:
             assert channels.settled is None
-        else:
-            truth = 30_000.0 + 20.0 * times[k - 1] + 1.5 * times[k - 1] ** 2
-            np.testing.assert_allclose(channels.settled, truth, atol=1e-6)
-
-
-def test_sigma_is_the_lag_of_the_slopes() -> None:
-    """Steadily faster, a chord lies above the curve by d (h - d) / 2 of the acceleration."""
-    channels, times, out = OneTime(), [4.0, 8.0, 12.0], (0.0, 0.0, 0.0)
-    for t, field in zip(times, turning(20.0, 3.0, times), strict=True):
-        out, _ = channels.bring(field, DELAYS, round(t * SECOND))
-    d = np.array(DELAYS)
-    lag = 0.5 * 3.0 * d * (4.0 - d)
-    np.testing.assert_allclose(np.array(out) - (30_000.0 + 20.0 * 12.0 + 1.5 * 144.0), lag, atol=1e-6)
-    assert channels.variance == pytest.approx(np.sum(np.square(lag)) / 3.0, rel=3e-3)
+            continue
+        np.testing.assert_allclose(channels.settled, truth[k - 1], atol=1e-6)
+        lag = 0.5 * 3.0 * d * (t - times[k - 1] - d)
+        np.testing.assert_allclose(np.array(out) - truth[k], lag, atol=1e-6)
+        if k == 2:  # as long an interval as the one before
+            assert channels.variance == pytest.approx(np.sum(np.square(lag)) / 3.0, rel=3e-3)
 
 
 @pytest.mark.parametrize("delays", [(0.0, 0.0, 0.0), (0.2, 0.2, 0.2)])
@@ -307,9 +290,8 @@ def test_a_reading_without_a_channel_tells_nothing_of_its_neighbours() -> None:
     readings[2] = (readings[2][0], float("nan"), readings[2][2])
     out = [channels.bring(f, DELAYS, round(t * SECOND))[0] for t, f in zip(times, readings, strict=True)]
     assert np.isnan(out[2][1])
-    np.testing.assert_allclose(
-        [out[2][0], out[2][2], *out[3]], 30_000.0 + 20.0 * np.array([12, 12, 16, 16, 16])
-    )
+    expected = 30_000.0 + 20.0 * np.array([12, 12, 16, 16, 16])
+    np.testing.assert_allclose([out[2][0], out[2][2], *out[3]], expected)
     np.testing.assert_allclose(channels.settled, 30_000.0 + 20.0 * 8.0)
 
 
@@ -317,12 +299,13 @@ def test_a_log_whose_channels_were_read_in_turn() -> None:
     """As live once the next reading is known; a row that stands twice, and a gap, harm none of the others."""
     time = np.array([3.0, 7.0, 7.0, 12.0, 15.0, 400.0, 404.0])
     read = [np.add(time, delay) for delay in DELAYS]
-    field = {
-        f"mag_{axis}": ("time", 30_000.0 + 20.0 * t + 1.5 * t * t)
-        for axis, t in zip("xyz", read, strict=True)
-    }
-    times = {f"mag_time_{axis}": ("time", t) for axis, t in zip("xyz", read, strict=True)}
-    together = at_one_time(xr.Dataset({**field, **times}, coords={"time": time}))
+    columns: dict[str, tuple[str, np.ndarray]] = {}
+    for axis, t in zip("xyz", read, strict=True):
+        columns |= {
+            f"mag_{axis}": ("time", 30_000.0 + 20.0 * t + 1.5 * t * t),
+            f"mag_time_{axis}": ("time", t),
+        }
+    together = at_one_time(xr.Dataset(columns, coords={"time": time}))
     assert not any(str(name).startswith("mag_time") for name in together)
     truth = 30_000.0 + 20.0 * time + 1.5 * time * time
     for axis in "xyz":

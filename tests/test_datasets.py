@@ -110,6 +110,16 @@ SEEN = mb.observations(LOG, "battpos")
 FRAME = mb.to_frame(LOG)
 WRONG_ARGUMENTS: dict[str, tuple[Callable[..., object], tuple[object, ...], dict[str, object], str]] = {
     "no file": (mb.read, ([],), {}, "paths: expected at least one file, got none"),
+    "absent file": (mb.read, ("none.csv",), {}, "none.csv: expected a file, there is none"),
+    "absent calibration": (mb.load, ("none.json",), {}, "none.json: expected a file, there is none"),
+    "absent grid": (mb.read_grid, ("none.nc",), {}, "none.nc: expected a file, there is none"),
+    "no folder": (mb.save, (INCHES, "none/x.json"), {}, "none/x.json: cannot be written"),
+    "no folder of a log": (mb.write, (LOG, "none/x.nc"), {}, "none/x.nc: cannot be written"),
+    "no log to survey": (mb.survey, ([],), {}, "deployments: expected at least one Dataset, got none"),
+    "no log to diagnose": (mb.diagnose, ([], INCHES), {}, "expected at least one"),
+    "no time": (mb.correct, (INCHES, LOG.rename(time="when")), {}, "column 'time': expected this column"),
+    "misspelt column": (mb.observations, (LOG, "batpos"), {}, "did you mean battpos"),
+    "misspelt method": (mb.fit, (SEEN, "nomnal"), {}, "did you mean nominal"),
     "no path": (mb.read, (None,), {}, "paths: expected a path or a sequence of paths, got None"),
     "no paths": (mb.read, ([None],), {}, r"paths: expected a path or a sequence of paths, got \[None\]"),
     "frame": (mb.correct_rows, (mb.Correction(INCHES), FRAME), {}, "got DataFrame; convert it with"),

@@ -28,9 +28,8 @@ def trees() -> dict[Path, ast.Module]:
 
 def offered(tree: ast.Module) -> list[str]:
     """Return the names in a module's ``__all__``."""
-    lists = [
-        n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"
-    ]
+    assigned = [n for n in tree.body if isinstance(n, ast.Assign)]
+    lists = [n.value for n in assigned if ast.unparse(n.targets[0]) == "__all__"]
     return list(ast.literal_eval(lists[0])) if lists else []
 
 
@@ -118,9 +117,8 @@ def test_a_name_in_a_docstring_exists() -> None:
     nodes = [n for tree in trees().values() for n in ast.walk(tree)]
     defined = {path.stem for path in trees()} | {room.name for path in trees() for room in path.parents}
     defined |= {n.name for n in nodes if isinstance(n, ast.ClassDef | ast.FunctionDef)}
-    defined |= {n.id for n in nodes if isinstance(n, ast.Name)} | {
-        n.arg for n in nodes if isinstance(n, ast.arg)
-    }
+    defined |= {n.id for n in nodes if isinstance(n, ast.Name)}
+    defined |= {n.arg for n in nodes if isinstance(n, ast.arg)}
     defined |= {n.attr for n in nodes if isinstance(n, ast.Attribute)}
     defined |= {(n.asname or n.name).rpartition(".")[2] for n in nodes if isinstance(n, ast.alias)}
     reference = re.compile(r":(?:class|func|meth|attr|data|mod|exc):`~?([\w.]+)`")

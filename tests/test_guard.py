@@ -126,9 +126,7 @@ def where() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (4, 0, 1, 2, 3)])
-def test_one_child_reads_several_files_and_another_what_follows_a_crash(
-    file: Path, order: tuple[int, ...]
-) -> None:
+def test_one_child_reads_several_files_and_another_after_a_crash(file: Path, order: tuple[int, ...]) -> None:
     child = Guarded([GuardedJob(file, read) for read in (where, where, crashes, where, stumbles)])
     found: dict[int, list[int]] = {}
     failed: dict[int, str] = {}

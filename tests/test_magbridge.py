@@ -4,7 +4,6 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from inspect import isfunction
@@ -49,9 +48,8 @@ def test_a_type_checker_sees_the_same_names() -> None:
     """They are imported for it alone; at run time each comes from the table of homes."""
     tree = ast.parse(Path(mb.__file__).read_text())
     (block,) = [n for n in tree.body if isinstance(n, ast.If)]
-    seen = {
-        (a.asname or a.name, n.module) for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names
-    }
+    imports = [n for n in block.body if isinstance(n, ast.ImportFrom)]
+    seen = {(a.asname or a.name, n.module) for n in imports for a in n.names}
     homes = {(name, f"magbridge.{home}") for name, home in mb._HOMES.items()}
     assert seen == homes | {("plot", "magbridge")}
     assert {name for name, _ in seen} == set(mb.__all__)
@@ -150,33 +148,3 @@ def test_datetimes_of_every_channel_are_accepted(tmp_path: Path) -> None:
     np.testing.assert_allclose(mb.reference_field(back), mb.reference_field(log))
     plan = mb.plan(replace(identity(), noise=Noise(1.0)), back, runs=1)
     assert len(plan.runs) == 1
-
-
-ATTEMPTS: tuple[tuple[Callable[..., object], tuple[object, ...]], ...] = (
-    (mb.survey, ([],)),
-    (mb.diagnose, ([], identity())),
-    (mb.read, ("none.csv",)),
-    (mb.load, ("none.json",)),
-    (mb.read_grid, ("none.nc",)),
-    (mb.save, (identity(), "none/x.json")),
-)
-
-
-@pytest.mark.parametrize(("function", "arguments"), ATTEMPTS)
-def test_every_error_is_a_magbridge_error(
-    function: Callable[..., object], arguments: tuple[object, ...]
-) -> None:
-    with pytest.raises(mb.MagbridgeError):
-        function(*arguments)
-
-
-def test_errors_about_a_dataset_are_magbridge_errors() -> None:
-    log = demo_log().isel(time=slice(0, 50))
-    with pytest.raises(mb.MagbridgeError, match="column 'time': expected this column"):
-        mb.correct_rows(mb.Correction(None), log.rename(time="when"))
-    with pytest.raises(mb.MagbridgeError, match="did you mean battpos"):
-        mb.observations(log, "batpos")
-    with pytest.raises(mb.MagbridgeError, match="cannot be written"):
-        mb.write(log, "none/x.nc")
-    with pytest.raises(mb.MagbridgeError, match="did you mean nominal"):
-        mb.fit(mb.observations(log), "nomnal")

@@ -37,12 +37,16 @@ def found() -> tuple[mb.Calibration, Observations]:
     return mb.fit(data, method="nominal").calibration, data
 
 
-def test_a_notebook_shows_a_fit_with_its_warnings() -> None:
+def test_a_notebook_shows_a_fit_as_a_line_with_its_warnings() -> None:
     fit = mb.fit(mb.observations(log, ("battpos", "ballast")))
     shown = fit._repr_html_()
     assert "&lt;Fit: " in shown
     assert fit.warnings
     assert shown.count("<li>") == len(fit.warnings)
+    for one in (fit, fit.calibration):
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 200
+    assert fit.calibration.method in repr(fit)
 
 
 def test_a_corrected_log(found: tuple[mb.Calibration, Observations]) -> None:
@@ -79,14 +83,6 @@ def test_a_grid_with_a_track() -> None:
     axes = mb.plot.grid(grid, log)
     assert np.size(axes.lines[0].get_xdata()) == log.sizes["time"]
     assert axes.collections[0].get_array().max() == 15.0
-
-
-def test_what_a_notebook_shows_is_a_line(found: tuple[mb.Calibration, Observations]) -> None:
-    fit = mb.fit(found[1], method="nominal")
-    for one in (fit, fit.calibration):
-        assert "\n" not in repr(one)
-        assert len(repr(one)) < 200
-    assert "nominal" in repr(fit)
 
 
 def test_a_name_is_not_read_as_mathematics() -> None:

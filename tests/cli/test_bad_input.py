@@ -206,9 +206,7 @@ def test_a_name_that_is_not_of_the_locale(deployment: Path, here: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", [{"PYTHONIOENCODING": "ascii:strict"}, {}])
-def test_what_cannot_be_printed_is_not_an_error(
-    encoding: dict[str, str], deployment: Path, here: Path
-) -> None:
+def test_what_cannot_be_printed_is_no_error(encoding: dict[str, str], deployment: Path, here: Path) -> None:
     plain = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
     done = run("convert", str(deployment), "-o", "\xb5.csv", **plain, **encoding)
     assert (done.returncode, done.stderr) == (0, b"")

@@ -119,9 +119,7 @@ def test_correct_writes_what_the_contract_names_as_netcdf_that_others_read(
         np.testing.assert_array_equal(theirs["latitude"], truth["latitude"])
 
 
-def test_a_field_that_the_earth_does_not_have_is_reported(
-    deployment: Path, calibration: Path, command: Command
-) -> None:
+def test_a_field_unlike_the_earths_is_reported(deployment: Path, calibration: Path, command: Command) -> None:
     """The calibration of another vehicle, with other magnets, gives such a field."""
     own = read(deployment).isel(time=slice(0, 100))
     for name, iron in (("own.nc", 0.0), ("other.nc", 50_000.0)):
@@ -131,9 +129,7 @@ def test_a_field_that_the_earth_does_not_have_is_reported(
         assert (doubt in output.err) == bool(iron)
 
 
-def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
-    deployment: Path, command: Command
-) -> None:
+def test_what_uses_a_calibration_repeats_that_it_is_not_supported(deployment: Path, command: Command) -> None:
     """The calibration is from runs that all head one way; `calibrate` refuses it without --force."""
     log = read(deployment)
     write(log.where((log["heading"] > 200.0) & (log["heading"] < 260.0), drop=True), "one_way.csv")
@@ -192,9 +188,7 @@ def test_a_grid_that_is_not_used_is_reported(deployment: Path, calibration: Path
     assert words in command("calibrate", deployment, "--grid", "grid.nc", "-o", "x.json").err
 
 
-def test_numbers_that_may_say_not_known_are_reported(
-    deployment: Path, calibration: Path, command: Command
-) -> None:
+def test_numbers_like_minus_9999_are_reported(deployment: Path, calibration: Path, command: Command) -> None:
     rows = read(deployment).isel(time=slice(0, FEW))
     rows["pump_current"] = rows["depth"] * 0.0 + 0.5
     rows["pump_current"].attrs["units"] = "A"
@@ -210,9 +204,7 @@ def test_numbers_that_may_say_not_known_are_reported(
     assert np.isnan(read(declared)["pump_current"]).sum() == 2
 
 
-def test_the_logs_that_a_calibration_was_made_from_are_remembered_and_reported(
-    deployment: Path, command: Command
-) -> None:
+def test_the_logs_that_a_calibration_was_made_from_are_reported(deployment: Path, command: Command) -> None:
     """Two logs of equal name, of two days in two folders, are both recorded."""
     rows = read(deployment)
     for day, begin in (("one", 0), ("two", FEW)):
@@ -298,17 +290,13 @@ def test_progress_without_a_terminal_is_lines(
     assert capsys.readouterr().err == "", "what is quick prints nothing"
     monkeypatch.setattr("magbridge.progress.LINE_INTERVAL_S", 0.0)
     assert list(track(range(2), "deployments", 2, in_lines=True)) == [0, 1]
-    assert (
-        capsys.readouterr().err
-        == "magbridge: deployments: 1 of 2, 0 s\nmagbridge: deployments: 2 of 2, 0 s\n"
-    )
+    title = "magbridge: deployments"
+    assert capsys.readouterr().err == f"{title}: 1 of 2, 0 s\n{title}: 2 of 2, 0 s\n"
     assert list(track(range(2), "reading", 2)) == [0, 1]
     assert capsys.readouterr().err == ""
 
 
-def test_only_what_the_sensor_measured_is_corrected(
-    deployment: Path, calibration: Path, command: Command
-) -> None:
+def test_only_what_the_sensor_saw_is_corrected(deployment: Path, calibration: Path, command: Command) -> None:
     """Telemetry in a separate file with its own times adds neither samples nor gaps."""
     rows = read(deployment).isel(time=slice(0, 300))
     whole = correct_rows(Correction(load_calibration(calibration)), rows)
@@ -325,13 +313,3 @@ def test_only_what_the_sensor_measured_is_corrected(
     calm = (before | after) & Quality.MOVING == 0
     assert calm.sum() > 200
     np.testing.assert_allclose(out["total_field"][calm], whole["total_field"][calm], atol=0.1)
-
-
-def test_the_dialect_for_other_programs(command: Command) -> None:
-    """The folder is new."""
-    assert "magbridge.xml" in command("dialect", "-o", "made/dialect").out
-    folder = Path("made/dialect")
-    names = {"MAVLINK_MSG_ID_MAG_FIELD", "MAVLINK_MSG_ID_MAG_COLUMN", "MAVLINK_MSG_ID_HEARTBEAT"}
-    for module in (folder / "magbridge_dialect.py", folder / "magbridge_ardupilotmega.py"):
-        text = module.read_text(encoding="utf-8")
-        assert all(f"{name} = " in text for name in names)

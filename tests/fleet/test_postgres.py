@@ -42,9 +42,8 @@ def server() -> Iterator[str]:
 
         def call(name: str, *arguments: str) -> None:
             command = [str(program(name)), "-D", f"{folder}/data", *arguments]
-            subprocess.run(
-                command, check=True, stdout=subprocess.DEVNULL, cwd=folder, user=OWNER if root else None
-            )
+            user = OWNER if root else None
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder, user=user)
 
         call("initdb", "-U", OWNER, "-A", "trust", "-E", "UTF8", "--no-sync")
         call("pg_ctl", "start", "-w", "-l", f"{folder}/log", "-o", f"-k {folder} -F -c listen_addresses=''")
@@ -54,9 +53,8 @@ def server() -> Iterator[str]:
             call("pg_ctl", "stop", "-m", "immediate")
 
 
-pytestmark = pytest.mark.skipif(
-    not (program("initdb") and program("pg_ctl")), reason="no PostgreSQL server is installed"
-)
+installed = program("initdb") and program("pg_ctl")
+pytestmark = pytest.mark.skipif(not installed, reason="no PostgreSQL server is installed")
 
 
 @pytest.fixture(scope="module")

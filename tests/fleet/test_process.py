@@ -50,9 +50,7 @@ def test_every_deployment_is_done_once(done: Catalogue) -> None:
     assert not new_jobs(done, jobs(done))
 
 
-def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(
-    catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_a_fault_of_one_log_is_a_line_and_the_rest_goes_on(catalogue: Catalogue, tmp_path: Path) -> None:
     add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",), sensor="HMR 1"))
     logs = [
         fly(tmp_path / "good.nc", 1, 0, sensor="HMR 1"),
@@ -65,7 +63,7 @@ def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(
     tables = work(job, tmp_path / "results").tables
     assert len(tables["calibrations"]) == len(tables["corrected"]) == 1
     lines = " | ".join(sorted(row["line"] for row in tables["failures"]))
-    assert "boot.nc: expected times of a known day, got 1970-01-01T00:01:40; give it one" in lines
+    assert "boot.nc: expected a date, got 1970-01-01T00:01:40; give it one" in lines
     assert "other.nc: expected a log of sensor 'HMR 1', which comet may carries, got 'HMR 2'" in lines
     assert "text.nc" in lines
     assert len(tables["failures"]) == 3
@@ -129,15 +127,14 @@ def test_what_is_wrong_with_the_moment_is_not_on_record(catalogue: Catalogue, tm
 def test_a_full_disk_is_a_line_and_nothing_is_on_record(flown: Path, tmp_path: Path) -> None:
     catalogue = catalogue_of(tmp_path, flown)
     job = jobs(catalogue)[0]
+    rows = [{**job.mark, "job": str(k), "diagnosed": 0, "mapped": 0} for k in range(999)]
     with full_disk(2000):
         refused = work(job, catalogue.results)
         assert refused.tables == {}
         assert refused.hindrance.startswith("one first: ")
         assert refused.hindrance.endswith(".nc: cannot be written: File too large")
         with pytest.raises(WriteError, match=r"done/.*\.parquet: cannot be written: File too large"):
-            catalogue.add(
-                "done", [{**job.mark, "job": str(k), "diagnosed": 0, "mapped": 0} for k in range(999)]
-            )
+            catalogue.add("done", rows)
     assert catalogue.rows("done") == []
     assert [path for path in catalogue.folder.rglob("*") if "partial" in path.name] == []
     assert len(new_jobs(catalogue, jobs(catalogue))) == 3
@@ -186,9 +183,7 @@ def test_a_change_is_dated_and_reported(catalogue: Catalogue, tmp_path: Path, co
     assert "Of many coefficients, some lie outside their bands by chance." in text
 
 
-def test_a_calibration_starts_from_its_fleet(
-    done: Catalogue, flown: Path, tmp_path: Path, command: Command
-) -> None:
+def test_a_fit_starts_from_its_fleet(done: Catalogue, flown: Path, tmp_path: Path, command: Command) -> None:
     log = fly(tmp_path / "third.nc", 1, 2)
     few = read(log)
     write(few.isel(time=np.isin(few["run"], np.unique(few["run"])[:2])), log)
@@ -244,9 +239,8 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
     def finished(count: int) -> Callable[[], bool]:
         return lambda: len(catalogue.rows("done")) >= count
 
-    scheduler = start(
-        "--port", "0", "--no-dashboard", "--scheduler-file", where, module="distributed.cli.dask_scheduler"
-    )
+    options = "--port", "0", "--no-dashboard", "--scheduler-file"
+    scheduler = start(*options, where, module="distributed.cli.dask_scheduler")
     try:
         until(where.exists, scheduler)
         worker = start(
@@ -265,9 +259,8 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
     early = len(catalogue.rows("done")) < 3  # it was not too late to be killed
     if early:
         assert command.returncode == 1, (out, output)
-        assert (
-            f"magbridge: {address}: the dask scheduler was lost; run magbridge fleet process again" in output
-        )
+        lost = f"magbridge: {address}: the dask scheduler was lost; run magbridge fleet process again"
+        assert lost in output
         assert "Traceback" not in output
     two = [start("fleet", "process", "--catalogue", folder, "--workers", "1") for _ in range(2)]
     if early:  # two people at once, of whom one is killed
@@ -292,8 +285,5 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
 
 @pytest.mark.parametrize("memory", ["lots", "4", "-1 GiB"])
 def test_a_worker_needs_an_amount_of_memory(memory: str) -> None:
-    with (
-        pytest.raises(WrongUse, match="--memory: expected an amount of at least 100 MB"),
-        client_of("", 1, memory),
-    ):
+    with pytest.raises(WrongUse, match="--memory: expected an amount"), client_of("", 1, memory):
         pass

@@ -176,12 +176,8 @@ def test_which_received_messages_raise_an_alarm() -> None:
     feed(3.0, "STATUSTEXT", severity=3, text="log failed: disk full")
     feed(3.1, "STATUSTEXT", severity=4, text="only a warning")
     fleet.due(20.0)
-    assert {alarm.key for alarm in alarms} == {
-        "stale_telemetry",
-        "Sensor",
-        "text: log failed: disk full",
-        "silence",
-    }
+    keys = {"stale_telemetry", "Sensor", "text: log failed: disk full", "silence"}
+    assert {alarm.key for alarm in alarms} == keys
 
 
 def test_alarms_of_one_cause_are_one_group() -> None:
