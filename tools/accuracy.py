@@ -140,9 +140,8 @@ def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         return A + np.triu(A, 1).T, size * x[6:]
 
     start = np.concatenate([np.eye(3)[upper], np.zeros(3)])
-    found = least_squares(
-        lambda x: remainder(*unpack(x), runs) / size, start, method="lm", xtol=1e-12, ftol=1e-12
-    )
+    options = {"method": "lm", "xtol": 1e-12, "ftol": 1e-12}
+    found = least_squares(lambda x: remainder(*unpack(x), runs) / size, start, **options)
     return unpack(found.x)
 
 
@@ -151,9 +150,8 @@ def remainder(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
     return np.asarray(np.linalg.norm((channels(part) - T) @ A.T, axis=1) - true_field(part))
 
 
-STUDY = Study(
-    run, ("noise", "masses", "method"), SCORES | {"0.8 to 1.25": Column("sigma", consistent, ".0%")}
-)
+COLUMNS = SCORES | {"0.8 to 1.25": Column("sigma", consistent, ".0%")}
+STUDY = Study(run, ("noise", "masses", "method"), COLUMNS)
 
 
 if __name__ == "__main__":

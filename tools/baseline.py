@@ -99,9 +99,8 @@ def diagnosis(entry: dict[str, Any]) -> list[Row]:
 
 def navigated(kind: Map, seed: int) -> list[Row]:
     """Navigate a glider over a random map; return the row, with the error over its bound."""
-    return [
-        row | {"ratio": row["drms"] / row["bound"]} for row in navigation.run_accuracy(kind, "wide", seed)
-    ]
+    rows = navigation.run_accuracy(kind, "wide", seed)
+    return [row | {"ratio": row["drms"] / row["bound"]} for row in rows]
 
 
 def real_logs() -> list[Row]:

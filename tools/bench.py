@@ -45,9 +45,8 @@ def measure(name: str, factor: float) -> dict[str, Any]:
     module, _, function = place.partition(":")
     before = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
-        rows: list[Row] = getattr(import_module(module), function)(
-            Path(folder), max(1, round(repetitions * factor))
-        )
+        count = max(1, round(repetitions * factor))
+        rows: list[Row] = getattr(import_module(module), function)(Path(folder), count)
     return {"name": name, "load": (before, os.getloadavg()[0]), "rows": rows}
 
 

@@ -149,16 +149,8 @@ def case(entry: Row) -> Row:
     result, found = judged.diagnosis, findings(judged)
     # if the reference is a map, the offset has changed by `TURN_ON` since the calibration
     world = ["offset_step"] * (entry["part"] == "charted")
-    row = (
-        entry
-        | judge(result, names, world)
-        | {
-            "unexplained": found["unexplained"],
-            "p_value": result.outcome.p_value,
-            "scores": _scores(found, names, whole),
-            "theory": [],
-        }
-    )
+    row = entry | judge(result, names, world) | {"theory": [], "scores": _scores(found, names, whole)}
+    row |= {"unexplained": found["unexplained"], "p_value": result.outcome.p_value}
     if entry["part"] in PREDICTED and names != ("outliers",):
         row["theory"] = [ideal(hidden[0], background, ds, result.outcome.look_elsewhere)]
     if entry["part"] == "charted":

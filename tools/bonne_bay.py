@@ -70,9 +70,8 @@ def run_diagnosis(reference: str, seed: int) -> list[Row]:
     calibration = fit(observations(parts["trial 1"], MASSES), "auto").calibration
     found = diagnose([parts["survey"]], calibration, training_logs=[parts["trial 1"]]).diagnosis
     survey = parts["survey"]
-    before, after = (
-        rms(corrected(survey, known).total - true_field(survey)) for known in (calibration, found.calibration)
-    )
+    both = calibration, found.calibration
+    before, after = (rms(corrected(survey, known).total - true_field(survey)) for known in both)
     causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
     return [{"causes": causes, "before": before, "after": after}]
 

@@ -124,9 +124,8 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
     def bend(H: Array) -> Array:
         rows = rng.choice(len(H) // 4, 12, replace=False) * 4
         out = H.copy()
-        out[rows, rng.integers(0, 3, 12)] += (
-            size * rng.choice([-1.0, 1.0], 12) * 2.0 ** rng.integers(0, 3, 12)
-        )
+        axes, signs = rng.integers(0, 3, 12), rng.choice([-1.0, 1.0], 12)
+        out[rows, axes] += size * signs * 2.0 ** rng.integers(0, 3, 12)
         return out
 
     scene.bend.append(bend)
@@ -388,17 +387,10 @@ def mooring(scene: Scene, size: float, rng: Generator) -> None:
     track = scene.track
     north, east = track.local(track.latitude, track.longitude)
     k, circle = rng.integers(len(north)), rng.uniform(40.0, 150.0)
-    turned = (
-        rng.uniform(0.0, 2.0 * np.pi)
-        + np.cumsum(autoregressive(rng, (len(scene.t),), 4e-4, 3600.0 / track.step)) * track.step
-    )
-    away = np.column_stack(
-        [
-            north - north[k] - circle * np.cos(turned),
-            east - east[k] - circle * np.sin(turned),
-            track.depth + rng.uniform(5.0, 15.0),
-        ]
-    )
+    start, rate = rng.uniform(0.0, 2.0 * np.pi), autoregressive(rng, scene.t.shape, 4e-4, 3600.0 / track.step)
+    turned = start + np.cumsum(rate) * track.step
+    x, y = north - north[k] - circle * np.cos(turned), east - east[k] - circle * np.sin(turned)
+    away = np.column_stack([x, y, track.depth + rng.uniform(5.0, 15.0)])
     own = dipole_field(away, np.broadcast_to(direction(rng), away.shape))
     scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
 

@@ -18,12 +18,14 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from studies import Column, Row, Study
+from study_worlds import MASSES
 
 from magbridge import fit, observations, save
 from magbridge.arrays import FloatArray
 from magbridge.bridge.events import Event, StartEvent, standstill
 from magbridge.bridge.pipeline import set_up
 from magbridge.calibration.fitting.observations import unfiltered
+from magbridge.columns import CHANNELS
 from magbridge.config import load as load_config
 from magbridge.records import Channel, Quality
 from sitl import load, segments, simulate
@@ -32,8 +34,6 @@ from sitl.replay.emulation import emulate, start_us
 from sitl.replay.listener import Listener
 from sitl.replay.setup import bridge_toml
 
-MASSES = ("battpos", "ballast")
-CHANNELS = ("mag_x", "mag_y", "mag_z")
 FAULT_AT = 0.27
 """Fraction of the survey after which a fault of kind `late` begins."""
 Rows = xr.Dataset
@@ -96,14 +96,11 @@ def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] =
     error = np.abs(field["total_field"] - truth)
     plain = (field["quality"].astype(int) & ~int(Quality.NO_BORESIGHT)) == 0
     wrong = plain & ~(error <= 3.0 * field["sigma"])
-    return Score(
-        len(plain),
-        int((~plain).sum()),
-        int(wrong.sum()),
-        float(error[plain].max()) if plain.any() else 0.0,
-        float(np.median(field["sigma"][plain])) if plain.any() else 0.0,
-        tuple(listener.texts),
-    )
+    worst, sigma = 0.0, 0.0
+    if plain.any():
+        worst, sigma = float(error[plain].max()), float(np.median(field["sigma"][plain]))
+    flagged = len(plain) - int(plain.sum())
+    return Score(len(plain), flagged, int(wrong.sum()), worst, sigma, tuple(listener.texts))
 
 
 # -- faults: rows in, rows out -----------------------------------------------------------------------------
@@ -140,9 +137,8 @@ def spikes(values: FloatArray, _: FloatArray) -> FloatArray:
 def silent(rows: Rows) -> Rows:
     """Remove the masses' telemetry in 25 of every 60 s."""
     seconds = rows["time"].to_numpy() - float(rows["time"][0])
-    return rows.assign(
-        {n: ("time", np.where(seconds % 60 < 25, np.nan, rows[n]), rows[n].attrs) for n in MASSES}
-    )
+    heard = seconds % 60 >= 25
+    return rows.assign({n: ("time", np.where(heard, rows[n], np.nan), rows[n].attrs) for n in MASSES})
 
 
 def late(rows: Rows) -> Rows:

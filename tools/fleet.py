@@ -61,9 +61,8 @@ class Flight(NamedTuple):
         for name, one in known.mass.items():
             new = self.refit == "battery" and name == "battpos"
             moment = fresh.mass[name].moment if new else tuple(rng.normal(one.moment, REFITTED["moment"]))
-            mass[name] = msgspec.structs.replace(
-                one, at=tuple(rng.normal(one.at, REFITTED["place"])), moment=moment
-            )
+            at = tuple(rng.normal(one.at, REFITTED["place"]))
+            mass[name] = msgspec.structs.replace(one, at=at, moment=moment)
         iron = rng.normal(known.hard_iron, REFITTED["fixed iron"])
         soft = rng.normal(known.soft_iron, REFITTED["soft iron"])
         up = np.random.default_rng([self.seed, self.vehicle, OFFSET + self.number])

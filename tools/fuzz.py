@@ -114,9 +114,8 @@ def _frames(_: Path) -> list[bytes]:
 
 
 def _frame_log(folder: Path) -> list[bytes]:
-    return [
-        b"".join(struct.pack(">Q", 1_700_000_000_000_000 + k) + f for k, f in enumerate(_frames(folder)[1:]))
-    ]
+    begin_us, frames = 1_700_000_000_000_000, _frames(folder)[1:]
+    return [b"".join(struct.pack(">Q", begin_us + k) + frame for k, frame in enumerate(frames))]
 
 
 def _calibration(_: Path) -> list[bytes]:
@@ -491,9 +490,8 @@ class Counts:
 def main() -> int:
     """Fuzz each target in turn; print the outcomes and return the exit code."""
     kinds = ["bytes", "file", "events"]
-    chosen = command_line(
-        __doc__, TARGETS, kind=kinds, n=10_000, seconds=float("inf"), seed=0, o=Path("fuzz")
-    )
+    limits = {"n": 10_000, "seconds": float("inf")}
+    chosen = command_line(__doc__, TARGETS, kind=kinds, **limits, seed=0, o=Path("fuzz"))
     shown = table("Fuzzing", "target", "tried", "read", "refused", "faults", "slowest, s", left=("target",))
     faults = 0
     for name in (name for name in chosen.names if TARGETS[name].kind in chosen.kind):

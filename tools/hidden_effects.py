@@ -185,8 +185,7 @@ SUMMARY = Study(run, ("foreign",), {name: Column(source, np.sum, ".0f") for name
 
 
 if __name__ == "__main__":
-    rows = STUDY.main(
-        __doc__, seeds=1, first=0, logs=list(VEHICLES), effects=list(EFFECTS), snr=12.0, data=DATA
-    )
+    options = {"logs": list(VEHICLES), "effects": list(EFFECTS), "snr": 12.0, "data": DATA}
+    rows = STUDY.main(__doc__, seeds=1, first=0, **options)
     judged = {"foreign": rows["effect"].isin(FOREIGN), "a_name": rows["named"] != "none"}
     show(SUMMARY.table("Number of cases", rows.assign(**judged, worse=rows["real"] > 1.02)))

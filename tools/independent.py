@@ -53,12 +53,9 @@ class Log:
         columns = self.columns | dict(zip(("mag_x", "mag_y", "mag_z"), readings.T, strict=True))
         if "reference_field" in columns:
             columns["reference_field"] = columns["reference_field"] + reference
-        variables = {
-            name: ("time", values, {"units": UNITS[name]})
-            for name, values in columns.items()
-            if name != "time"
-        }
-        return xr.Dataset(variables, {"time": self.time}, {"source": "another world"})
+        time = columns.pop("time")
+        variables = {name: ("time", values, {"units": UNITS[name]}) for name, values in columns.items()}
+        return xr.Dataset(variables, {"time": time}, {"source": "another world"})
 
     def visible(self, effect: FloatArray) -> FloatArray:
         """Return the part of an effect (n, 3) along the field, which changes the total field (n,), nT."""

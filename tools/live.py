@@ -96,9 +96,8 @@ def pump(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
     """Return the field (n, 3) of a pump, on for 2 of 10 min, whose wiring changes at 40 % of the survey."""
     current = 2.0 * ((hours_of(log) * 6.0) % 1.0 < 0.2)
     log["pump_current"] = "time", current, {"units": "A"}
-    return np.asarray(
-        (current * (hours_of(log) > 0.4 * hours_of(log)[-1]))[:, None] * 0.5 * size * direction(rng)
-    )
+    changed = hours_of(log) > 0.4 * hours_of(log)[-1]
+    return np.outer(current * changed, 0.5 * size * direction(rng))
 
 
 def clock(log: xr.Dataset, _: np.random.Generator, size: float) -> np.ndarray:
@@ -200,13 +199,9 @@ def best_field(
 def fly(name: str, seed: int, length: float) -> tuple[xr.Dataset, xr.Dataset]:
     """Simulate a glider; return its runs, and its survey at twice the rate that :func:`sampled` keeps."""
     straight = Leg(
-        duration=3600.0 * length,
-        pitch=0.0,
-        roll=1.0,
-        heading=70.0,
-        segment="survey",
-        parameters={"battpos": 0.0, "ballast": 0.0},
-    )
+        duration=3600.0 * length, pitch=0.0, roll=1.0, heading=70.0, segment="survey",
+        parameters=dict.fromkeys(MASSES, 0.0),
+    )  # fmt: skip
     survey = Legs((straight,)) if name == "straight over rock" else CrissCross(hours=length, roll=(1.0, 2.0))
     scenario = load("random_glider").replace(
         world={"geology": CRUST}, mission=(Spirals(), survey), instrument={"rate": 1.0 / AGE_S}

@@ -15,7 +15,7 @@ the log held out in turn.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,11 +98,7 @@ def ardusub(folder: Path) -> Vehicle:
     return _halves(read(folder / "ardusub" / "small.tlog"))
 
 
-VEHICLES: dict[str, Callable[[Path], Vehicle]] = {
-    "magnav_flt1002": flight,
-    "seaglider_sg167": seaglider,
-    "ardusub": ardusub,
-}
+VEHICLES = {"magnav_flt1002": flight, "seaglider_sg167": seaglider, "ardusub": ardusub}
 
 
 def _halves(log: xr.Dataset) -> Vehicle:
@@ -312,9 +308,8 @@ STUDIES = {
 
 def main() -> None:
     """Print the tables of the parts."""
-    chosen = command_line(
-        __doc__, STUDIES, data=DATA, log=[DATA / "ardusub" / "small.tlog"], out=Path, workers=2
-    )
+    logs = [DATA / "ardusub" / "small.tlog"]
+    chosen = command_line(__doc__, STUDIES, data=DATA, log=logs, out=Path, workers=2)
     warnings.simplefilter("ignore")
     cases: dict[str, list[tuple[Any, ...]]] = {
         "seaglider": [(*choice, chosen.data) for choice in SEAGLIDER_CHOICES],

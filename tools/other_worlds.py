@@ -263,9 +263,8 @@ SOURCES = {
     "found": "found", "a name": "name", "right": "right", "in the set": "in_set", "alone": "alone",
     "a second": "second",
 }  # fmt: skip
-STUDY = Study(
-    run, ("world", "kind"), {heading: Column(name, np.mean, ".0%") for heading, name in SOURCES.items()}
-)
+COLUMNS = {heading: Column(name, np.mean, ".0%") for heading, name in SOURCES.items()}
+STUDY = Study(run, ("world", "kind"), COLUMNS)
 
 
 if __name__ == "__main__":

@@ -70,9 +70,8 @@ def _lengths(line: int, sentence: str) -> Iterator[Finding]:
 
 def _page(text: str) -> Iterator[tuple[int, str]]:
     """Yield line and text of each sentence of a page, without code blocks, tables and headings."""
-    text = re.sub(
-        r"```.*?```|<!--.*?-->", lambda block: "\n" * block.group().count("\n"), text, flags=re.DOTALL
-    )
+    fenced = re.compile(r"```.*?```|<!--.*?-->", re.DOTALL)
+    text = fenced.sub(lambda block: "\n" * block.group().count("\n"), text)
     start, paragraph = 1, ""
     for number, line in enumerate([*text.split("\n"), ""], 1):
         is_item = re.match(r"\s*(?:[-*+]|\d+\.|:)\s+", line)
@@ -155,9 +154,8 @@ def main() -> int:
             for line, rule, text, advice in findings:
                 print(f"{file}:{line}: {rule}: …{text}… -> {advice}")
             total, words = total + len(findings), words + count
-    print(
-        f"{total} findings in {words:,} words: {1000 * total / max(words, 1):.1f} per 1,000", file=sys.stderr
-    )
+    rate = 1000 * total / max(words, 1)
+    print(f"{total} findings in {words:,} words: {rate:.1f} per 1,000", file=sys.stderr)
     return int(total > 0)
 
 

@@ -135,9 +135,8 @@ def compensate(seed: int, second: bool, known: bool, hidden: bool) -> list[dict[
     """Fit one half of a flight by each method and test the other; return a row for each method."""
     whole = flight(seed, hidden)
     middle = len(whole.time) // 2
-    halves = [
-        ScalarSeries(*(column[rows] for column in whole)) for rows in (slice(middle), slice(middle, None))
-    ]
+    parts = slice(middle), slice(middle, None)
+    halves = [ScalarSeries(*(column[rows] for column in whole)) for rows in parts]
     train, test = halves[not second], halves[second]
     kind = "hidden" if hidden else "map" if known else "no map"
     main = np.full(middle, np.median(train.reference))
@@ -162,9 +161,8 @@ def compensate(seed: int, second: bool, known: bool, hidden: bool) -> list[dict[
             row["flagged"] = 100.0 * float(seen.disagrees.mean())
         else:
             sensor = fits["this fit"].sensor
-            error = (
-                _linear(seen_train, test, method, sensor.channels, sensor.reference_field) - test.reference
-            )
+            linear = _linear(seen_train, test, method, sensor.channels, sensor.reference_field)
+            error = linear - test.reference
         row |= {"rms": float(np.sqrt(np.mean(error**2))), "about_mean": float(np.std(error))}
         rows.append(row)
     return rows

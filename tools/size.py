@@ -44,9 +44,8 @@ def parts(groups: dict[str, list[str]]) -> dict[str, tuple[int, int]]:
         for name, folders in groups.items()
     }
     counts["package"] = count(ROOT / "magbridge")
-    named = [
-        count(ROOT / folder) for folders in groups.values() for folder in folders if "magbridge/" in folder
-    ]
+    inside = [folder for folders in groups.values() for folder in folders if "magbridge/" in folder]
+    named = [count(ROOT / folder) for folder in inside]
     rest = [counts["package"][i] - sum(part[i] for part in named) for i in (0, 1)]
     top = counts["fleet, monitor, cli, top level"]
     counts["fleet, monitor, cli, top level"] = top[0] + rest[0], top[1] + rest[1]
@@ -80,10 +79,8 @@ def print_comments(required: dict[str, float]) -> bool:
     too_few = False
     print(f"{'package':34} {'code':>7} {'comments':>8} {'per 100':>7} {'required':>8} {'one in':>7}")
     for name in NUMERICAL:
-        counts = [
-            code_and_comments(path.read_text(encoding="utf-8"))
-            for path in (ROOT / "magbridge" / name).rglob("*.py")
-        ]
+        paths = (ROOT / "magbridge" / name).rglob("*.py")
+        counts = [code_and_comments(path.read_text(encoding="utf-8")) for path in paths]
         code, comments = map(sum, zip(*counts, strict=True))
         per_100 = 100 * comments / code
         least = required.get(name, required.get("default", 0.0))

@@ -177,9 +177,8 @@ class Study:
     def rows(self, cases: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> pd.DataFrame:
         """Return the rows of all cases; run only the cases that the file ``--out`` lacks."""
         path: Path | None = options.out
-        kept = (
-            pd.read_parquet(path) if path is not None and path.exists() else pd.DataFrame({"arguments": []})
-        )
+        is_stored = path is not None and path.exists()
+        kept = pd.read_parquet(path) if is_stored else pd.DataFrame({"arguments": []})
         names = [repr(case) for case in cases]
         known = set(kept["arguments"])
         todo = [(self.run, case) for case, name in zip(cases, names, strict=True) if name not in known]

@@ -115,9 +115,8 @@ def fly_survey(
     sigma, memory = NOISES[noise]
     same = {"hours": hours, "pitch": (25.0, 2.5), "roll": (1.0, 2.0), "battery_spread": 0.1}
     parts = [Spirals(), CrissCross(**same), CrissCross(**same, segment="another day")]  # type: ignore[arg-type]
-    scenario = load("random_glider").replace(
-        mission=tuple(parts), instrument={"noise_sigma": sigma, "noise_memory": memory}
-    )
+    instrument = {"noise_sigma": sigma, "noise_memory": memory}
+    scenario = load("random_glider").replace(mission=tuple(parts), instrument=instrument)
     twin = Twin.draw(scenario, seed)
     latitude, longitude = twin.world.origin
     when = np.array([scenario.start.timestamp()])
@@ -134,18 +133,13 @@ def drifted(log: xr.Dataset, by: float) -> xr.Dataset:
     t = (log["time"] - log["time"][0]) / float(log["time"][-1] - log["time"][0])
     per_latitude, per_longitude = metres_per_degree(float(log["latitude"].mean()))
     north, east = by * np.sin(2.2 * np.pi * t + 0.3), by * (np.cos(1.7 * np.pi * t) - 1.0)
-    return log.assign(
-        latitude=log["latitude"] + north / per_latitude, longitude=log["longitude"] + east / per_longitude
-    )
+    latitude = log["latitude"] + north / per_latitude
+    return log.assign(latitude=latitude, longitude=log["longitude"] + east / per_longitude)
 
 
 # ---- the paper's trials ------------------------------------------------------------------------------------
 
-METHODS: dict[str, dict[str, Any]] = {
-    "nominal": {"constrained": True},
-    "cubic": {},
-    "auto": {},
-}
+METHODS: dict[str, dict[str, Any]] = {"nominal": {"constrained": True}, "cubic": {}, "auto": {}}
 """Options of the fit by method: the paper's two methods with its constraints, and the default."""
 TRIALS = ("trial 1", "trial 2")
 PAPER = {
@@ -301,9 +295,8 @@ def survey_bound(
     g, floor = _sensitivity(vehicle, survey, sigma)
     step = -(-len(g) // MAX_COVARIANCE_SAMPLES)
     n = len(g) // step
-    g, place, floor = (
-        part[: n * step].reshape(n, step, -1).mean(axis=1) for part in (g, place, floor[:, None])
-    )
+    parts = g, place, floor[:, None]
+    g, place, floor = (part[: n * step].reshape(n, step, -1).mean(axis=1) for part in parts)
 
     def correlation(samples: int, distance: int) -> FloatArray:
         lag = distance * np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
@@ -346,9 +339,8 @@ def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[FloatArray, Flo
     positions = {name: deployment[name].to_numpy() for name in vehicle.channels}
     n, unit = deployment.sizes["time"], 1e4
     T = vehicle.field(np.zeros((n, 3)), positions)
-    D = np.stack(
-        [(vehicle.field(np.tile(unit * e, (n, 1)), positions) - T) / unit for e in np.eye(3)], axis=-1
-    )
+    shifted = [vehicle.field(np.tile(unit * e, (n, 1)), positions) for e in np.eye(3)]
+    D = np.stack([(field - T) / unit for field in shifted], axis=-1)
     return D, T
 
 

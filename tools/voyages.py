@@ -72,9 +72,8 @@ def synthetic(kind: Map, seed: int, extent: float = 16_000.0) -> AnomalyGrid:
     east, north = np.exp(1j * np.outer(y, k[:, 0])), np.exp(1j * (np.outer(y, k[:, 1]) + phase))
     values = np.real(north @ east.T)
     per_latitude, per_longitude = metres_per_degree(PLACE[0])
-    return AnomalyGrid(
-        PLACE[1] + y / per_longitude, PLACE[0] + y / per_latitude, kind.rms * values / values.std()
-    )
+    anomaly = kind.rms * values / values.std()
+    return AnomalyGrid(PLACE[1] + y / per_longitude, PLACE[0] + y / per_latitude, anomaly)
 
 
 def track_over(
@@ -216,34 +215,20 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Run:
             found.append((record.time_us * 1e-6, *place, *spread, record.state, record.valid))
     seconds = clock.process_time() - begun
     table = np.array(found, float)
-    away = np.stack(
-        [np.interp(table[:, 0], ds["time"], ds[f"away_{axis}"]) for axis in ("north", "east")], axis=1
-    )
+    series = [ds[f"away_{axis}"] for axis in ("north", "east")]
+    away = np.stack([np.interp(table[:, 0], ds["time"], one) for one in series], axis=1)
     error = table[:, 1:3] - away
     nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(table[:, 3:7].reshape(-1, 2, 2)), error)
-    corners = slice(None, None, 5)
-    best = position_bound(
-        grid,
-        ds["time"].to_numpy()[corners],
-        ds["truth_latitude"].to_numpy()[corners],
-        ds["truth_longitude"].to_numpy()[corners],
-        options,
-        float(ds["total_field_sigma"].median()),
-        30.0,
-        every,
-    )
+    corners = ds.isel(time=slice(None, None, 5))
+    names = "time", "truth_latitude", "truth_longitude"
+    when, latitude, longitude = (corners[name].to_numpy() for name in names)
+    sigma = float(ds["total_field_sigma"].median())
+    best = position_bound(grid, when, latitude, longitude, options, sigma, 30.0, every)
     half = best.time > 0.5 * (best.time[0] + best.time[-1])
     return Run(
-        (table[:, 0] - START) / HOUR,
-        np.hypot(*error.T),
-        nees,
-        table[:, 7].astype(int),
-        table[:, 8] > 0,
-        rms(best.sigma[half]),
-        rms(best.unaided[half]),
-        grid.correlation_length,
-        seconds / ds.sizes["time"],
-    )
+        (table[:, 0] - START) / HOUR, np.hypot(*error.T), nees, table[:, 7].astype(int), table[:, 8] > 0,
+        rms(best.sigma[half]), rms(best.unaided[half]), grid.correlation_length, seconds / ds.sizes["time"],
+    )  # fmt: skip
 
 
 def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Iterator[tuple[Block, float]]:

@@ -127,9 +127,8 @@ def latency(folder: Path, repetitions: int) -> list[Row]:
             ours, floor = (median(np.nanpercentile(late, q) for late, _ in runs) for runs in (bridge, echo))
             rows.append(Row(f"latency at {hertz:,} Hz, {name}", ours, "ms", floor, "echo", most=most))
         late = np.concatenate([late for late, _ in bridge])
-        rows.append(
-            Row(f"lost at {hertz:,} Hz, of {len(late):,}", int(np.isnan(late).sum()), "samples", most=0)
-        )
+        lost = int(np.isnan(late).sum())
+        rows.append(Row(f"lost at {hertz:,} Hz, of {len(late):,}", lost, "samples", most=0))
         ours, floor = (median(cpu for _, cpu in runs) / (hertz * SECONDS) * 1e6 for runs in (bridge, echo))
         what = f"processor time at {hertz:,} Hz, kernel and log included"
         rows.append(Row(what, ours, "us", floor, "echo"))

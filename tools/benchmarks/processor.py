@@ -139,9 +139,8 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[fl
 
 def learning(folder: Path, repetitions: int) -> list[Row]:
     """Measure a bridge with and a bridge without in-flight calibration."""
-    pipelines = {
-        more: set_up(load(write_config(folder, more=more)), StartEvent(BEGIN_US)) for more in ("", LEARNING)
-    }
+    configs = {more: load(write_config(folder, more=more)) for more in ("", LEARNING)}
+    pipelines = {more: set_up(config, StartEvent(BEGIN_US)) for more, config in configs.items()}
     feed, times = Feed(), {more: list[float]() for more in pipelines}
     gc.collect()
     gc.freeze()

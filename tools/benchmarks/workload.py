@@ -86,9 +86,8 @@ class Feed:
         for second in range(seconds):
             start_us = begin_us + second * 1_000_000
             due = [(start_us, Channel.LINK, -1)]
-            due += [
-                (start_us + i * 1_000_000 // TELEMETRY_HZ + 500, Channel.LINK, i) for i in range(TELEMETRY_HZ)
-            ]
+            first_us, step_us = start_us + 500, 1_000_000 // TELEMETRY_HZ
+            due += [(first_us + i * step_us, Channel.LINK, i) for i in range(TELEMETRY_HZ)]
             due += [(start_us + i * 1_000_000 // hertz + 3000, Channel.SENSOR, i) for i in range(hertz)]
             for time_us, channel, index in sorted(due):
                 data = self.reading(hertz) if channel is Channel.SENSOR else self.message(time_us)

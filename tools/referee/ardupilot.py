@@ -9,13 +9,10 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
 from referee.autopilot import Autopilot, Truth, finite
 
-PLANE_RATES_HZ = dict.fromkeys(
-    (
-        *("ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
-        *("EKF_STATUS_REPORT", "SYS_STATUS"),
-    ),
-    1.0,
-)
+PLANE_RATES_HZ = {
+    "ATTITUDE": 1.0, "VFR_HUD": 1.0, "GPS_RAW_INT": 1.0, "GLOBAL_POSITION_INT": 1.0,
+    "LOCAL_POSITION_NED": 1.0, "EKF_STATUS_REPORT": 1.0, "SYS_STATUS": 1.0,
+}  # fmt: skip
 """Rates of messages after a start, Hz: ArduPlane/GCS_MAVLink_Plane.cpp, var_info (SRn_*); also Rover, Sub."""
 COPTER_RATES_HZ: dict[str, float] = {}
 """Rates of messages after a start, Hz: ArduCopter/GCS_MAVLink_Copter.cpp, var_info: all SRn_* are 0."""

@@ -58,11 +58,8 @@ class PositionFilter:
         """Update the filter with a measured position (m) of a `variance` (m²)."""
         s = self.pp + variance
         self._shift(place, self.pp / s, self.pw / s)
-        self.pp, self.pw, self.ww = (
-            self.pp * variance / s,
-            self.pw * variance / s,
-            self.ww - self.pw * self.pw / s,
-        )
+        kept = variance / s
+        self.pp, self.pw, self.ww = self.pp * kept, self.pw * kept, self.ww - self.pw * self.pw / s
 
     def force(self, place: Pair, variance: float) -> None:
         """Update the filter with a measured position: gain 1 for position, Kalman gain for wind.
@@ -250,13 +247,8 @@ class Autopilot:
             known = message.id == spec("COMMAND_INT").id
             result = self._external(message) if known else MAV_RESULT.COMMAND_INT_ONLY
             self.taken[result.name] += 1
-        return self._codec.pack(
-            "COMMAND_ACK",
-            command=number,
-            result=result,
-            target_system=message.system,
-            target_component=message.component,
-        )
+        to = {"target_system": message.system, "target_component": message.component}
+        return self._codec.pack("COMMAND_ACK", command=number, result=result, **to)
 
     def _external(self, message: Message) -> MAV_RESULT:
         """Process EXTERNAL_POSITION_ESTIMATE; return the result of the command."""
@@ -352,18 +344,11 @@ class Autopilot:
     def _own_odometry(self, truth: Truth) -> bytes:
         (north, east), (vn, ve), yaw = self.filter.position, self.filter.velocity, radians(truth.heading)
         return self._codec.pack(
-            "ODOMETRY",
-            time_usec=self._now_us,
-            frame_id=MAV_FRAME.LOCAL_NED,
-            child_frame_id=MAV_FRAME.BODY_FRD,
-            x=north,
-            y=east,
-            z=truth.depth + self.origin[2],
-            q=(cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw)),
-            vx=vn * cos(yaw) + ve * sin(yaw),
-            vy=ve * cos(yaw) - vn * sin(yaw),
-            reset_counter=self._resets & 0xFF,
-        )
+            "ODOMETRY", time_usec=self._now_us, reset_counter=self._resets & 0xFF,
+            frame_id=MAV_FRAME.LOCAL_NED, child_frame_id=MAV_FRAME.BODY_FRD,
+            x=north, y=east, z=truth.depth + self.origin[2], q=(cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw)),
+            vx=vn * cos(yaw) + ve * sin(yaw), vy=ve * cos(yaw) - vn * sin(yaw),
+        )  # fmt: skip
 
 
 def finite(*values: float) -> bool:

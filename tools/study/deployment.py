@@ -163,9 +163,8 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[FloatArray, Float
     W = calibration.kernel.weights.copy()
     W[0, :3] -= 1.0
     W[:, :6] *= calibration.reference.field
-    samples = ResidualSamples(
-        H, ds["reference_field"].to_numpy(), phi, np.ones(len(H)), calibration.reference.field
-    )
+    reference, field = ds["reference_field"].to_numpy(), calibration.reference.field
+    samples = ResidualSamples(H, reference, phi, np.ones(len(H)), field)
     e, g = residuals(samples, W.ravel())
     return e, jacobian(phi, g)
 

@@ -211,17 +211,10 @@ def information(
     candidates = [c for cause in CAUSES.values() for c in cause.candidates(problem)]
     table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), noise, rows)
     X = np.column_stack([table, hidden.signature])
-    spans = [
-        Span(
-            EQUIVALENT.get(c.cause, c.cause),
-            c.channel,
-            own,
-            float(np.log(c.look_elsewhere)),
-            c.positive,
-            c.spectra,
-        )
-        for c, own in zip(candidates, slices(candidates, 0), strict=True)
-    ]
+    spans = []
+    for c, own in zip(candidates, slices(candidates, 0), strict=True):
+        cause, price = EQUIVALENT.get(c.cause, c.cause), float(np.log(c.look_elsewhere))
+        spans.append(Span(cause, c.channel, own, price, c.positive, c.spectra))
     projected = project(X, background.columns, background.deployment.prior)
     measured = whiten(compare(ds, calibration)[0], noise, rows)
     return spans, X.T @ projected, projected.T @ (measured - hidden.signature)[:, None]
