@@ -43,9 +43,8 @@ AGE = "age_"
 
 TEMPERATURE = "sensor_temperature"
 """Column of the temperature at the fluxgate: the only calibration channel that comes with a reading."""
-_TABLES: dict[str, dict[str, list[str]]] = tomllib.loads(
-    Path(__file__).with_name("standard_columns.toml").read_text("utf-8")
-)
+_TEXT = Path(__file__).with_name("standard_columns.toml").read_text("utf-8")
+_TABLES: dict[str, dict[str, list[str]]] = tomllib.loads(_TEXT)
 COLUMNS = {name: Column(units, meaning) for name, (units, meaning) in _TABLES["columns"].items()}
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
 """Columns that ``magbridge correct`` writes in addition to ``time``."""

@@ -317,9 +317,8 @@ def load(path: str | Path) -> Config:
     range, or a file that it names does not exist.
     """
     path = Path(path)
-    config = msgspec.structs.replace(
-        parse(load_toml(path), path), digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    )
+    config = parse(load_toml(path), path)
+    config = msgspec.structs.replace(config, digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16])
     for key, name in config.files.items():
         if name is not None and not config.resolve(name).exists():
             raise ConfigError(path, key, f"no such file: {config.resolve(name)}")
@@ -354,11 +353,8 @@ def parse(table: dict[str, Any], path: Path) -> Config:
     calibration = config.calibration
     if main.calibration is not None:
         if calibration is not None:
-            raise ConfigError(
-                path,
-                "calibration.file",
-                f"expected one calibration of {main.label}, got this and its own; remove one",
-            )
+            expected = f"expected one calibration of {main.label}, got this and its own; remove one"
+            raise ConfigError(path, "calibration.file", expected)
         calibration = CalibrationFile(file=main.calibration)
     _check_sources(config.telemetry, path)
     return msgspec.structs.replace(

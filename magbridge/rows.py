@@ -134,9 +134,8 @@ def refuse_unsuited(calibration: Calibration, log: xr.Dataset) -> None:
     """
     source, sensor = log.attrs.get("source", "the deployment"), str(log.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):
-        raise FormatError(
-            source, f"expected a log of sensor {calibration.sensor.name!r}, the calibration's, got {sensor!r}"
-        )
+        name = calibration.sensor.name
+        raise FormatError(source, f"expected a log of sensor {name!r}, the calibration's, got {sensor!r}")
     require_units(log, calibration.units)
     channels = log[list(CHANNELS)].to_array().to_numpy().T
     if wrong := other_units(channels, calibration.reference.field):

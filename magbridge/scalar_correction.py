@@ -108,10 +108,8 @@ class ScalarCorrection:
             count = self._complete(now_us)
             ready = [pending.popleft() for _ in range(count)]
             results, flags = self._compensate([one.sample for one in ready])
-        return [
-            self._checked(one, total, sigma, flag)
-            for one, (total, sigma), flag in zip(ready, results, flags, strict=True)
-        ]
+        together = zip(ready, results, flags, strict=True)
+        return [self._checked(one, total, sigma, flag) for one, (total, sigma), flag in together]
 
     def _complete(self, now_us: int) -> int:
         """Return the number of pending readings, from the first, that need not wait longer."""

@@ -117,10 +117,8 @@ def _check(config: Path, *, live: bool, json: bool) -> None:
     facts = {"file": str(config), "would_start": not errors, "findings": faults_of, **arriving}
     cli.print_result(facts, "" if errors else f"{config}: the bridge would start, {warnings}", json)
     if errors:
-        raise cli.FailedResult(
-            f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}",
-            WrongUse.exit_code,
-        )
+        text = f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}"
+        raise cli.FailedResult(text, WrongUse.exit_code)
 
 
 def _listen(config: Path, *, quiet: bool) -> tuple[list[ConfigFault], dict[str, Any]]:
@@ -183,9 +181,7 @@ def replay(
         result = played(files, config, speed_of(speed), log, reading.options)
     cli.print_result(result, summary(result), json)
     if not all(run["identical"] or run["is_cut"] for run in result.get("runs", ())):
-        raise cli.FailedResult(
-            "the replay published other values than the log holds; the runs with differences are listed above"
-        )
+        raise cli.FailedResult("the replay published other values than the log holds; see the runs above")
 
 
 @cli.command("dialect -o DIR")

@@ -215,11 +215,10 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
             logs_digests = {digest(file) for file in request.files}
             start = predict(model.fleet, model.vehicle, model.refit, logs_digests)
     with waiting("reading"):
-        logs = cli.by_base_station(
-            read_each(request.files, options=request.reading.options), request.fit.base
-        )
+        options = request.reading.options
+        logs = cli.by_base_station(read_each(request.files, options=options), request.fit.base)
         deployment = join(logs)
-        if request.reading.options.strict:
+        if options.strict:
             refuse_repeated(deployment)
     require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *request.fit.named))
     deployment = with_true_heading(deployment, truth.heading_reference)
@@ -264,22 +263,20 @@ def _fit(
     from magbridge.calibration.fitting.sources import unused_logs
 
     model, asked, anomalies = request.model, request.fit, request.anomalies
-    names = asked.parameter or (start.names if start else ())
+    names, order = asked.parameter or (start.names if start else ()), asked.order
     options: dict[str, Any] = asked.drift
     if model.masses:
         options["vehicle"] = read_vehicle(model.masses)
     with cli.naming(deployment), waiting("fitting"):
-        names = cli.chosen_parameters(
-            names, deployment, grid=anomalies, order=asked.order, site_bias=site_bias
-        )
+        names = cli.chosen_parameters(names, deployment, grid=anomalies, order=order, site_bias=site_bias)
         read = (*request.files, *request.reading.sensor_log, *filter(None, [asked.base]))
         data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
         cli.complain_all(unused_logs(logs, data))
         data = unfiltered(data, model.filter_cutoff) if model.filter_cutoff else data
         if start:
-            found, remarks, worth = _from_fleet(start, data, asked.order, site_bias=site_bias, **options)
+            found, remarks, worth = _from_fleet(start, data, order, site_bias=site_bias, **options)
         else:
-            found, remarks = _fitted(logs, data, model.method, asked.order, site_bias=site_bias, **options)
+            found, remarks = _fitted(logs, data, model.method, order, site_bias=site_bias, **options)
             worth = {}
     refused = not (found.supported or request.force)
     cli.complain_all((*found.warnings[refused:], *remarks, *_undeclared_columns(deployment, data, found)))

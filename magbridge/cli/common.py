@@ -141,9 +141,8 @@ class ReadingOptions:
     def options(self) -> Options:
         """These options as an object of :mod:`magbridge.logs`."""
         boot = None if self.date is None else dt.datetime.combine(self.date, dt.time(), dt.UTC).timestamp()
-        return Options(
-            self.strict, boot, self.compass, self.sensor_log, self.clock_offset, self.column, self.columns
-        )
+        sensor = self.sensor_log, self.clock_offset
+        return Options(self.strict, boot, self.compass, *sensor, self.column, self.columns)
 
     @property
     def without_sensor_logs(self) -> Options:

@@ -176,9 +176,8 @@ def _corrected(
         yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
         whole = whole or bool(sampled.all("variable").any())
     if not whole:
-        raise DataError(
-            f"{', '.join(map(str, files))}: expected rows with all of {' '.join(CHANNELS)}, got none"
-        )
+        names = ", ".join(map(str, files))
+        raise DataError(f"{names}: expected rows with all of {' '.join(CHANNELS)}, got none")
 
 
 def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learner:

@@ -18,11 +18,8 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     from magbridge.fleet.learn import History
 
-fleet = App(
-    name="fleet",
-    help="Many vehicles, many logs, one memory: catalogue, process, learn from them, watch them.",
-    help_format="markdown",
-)
+ABOUT = "Many vehicles, many logs, one memory: catalogue, process, learn from them, watch them."
+fleet = App(name="fleet", help=ABOUT, help_format="markdown")
 cli.app.command(fleet)
 Where = Annotated[str, Parameter(help="The catalogue: a folder, or postgresql://USER@HOST/DATABASE.")]
 HERE = "fleet"

@@ -137,10 +137,8 @@ class Catalogue(ABC):
 
     def _check_format(self, found: int) -> None:
         if found > CATALOGUE_FORMAT:
-            raise FormatError(
-                self.name,
-                f"expected a catalogue of format {CATALOGUE_FORMAT} at most, got {found}; update magbridge",
-            )
+            expected = f"expected a catalogue of format {CATALOGUE_FORMAT} at most"
+            raise FormatError(self.name, f"{expected}, got {found}; update magbridge")
 
 
 class FolderCatalogue(Catalogue):

@@ -199,7 +199,7 @@ def learn_fleet(
     """
     if not lessons:
         raise DataError("no deployment with these masses has been calibrated; run magbridge fleet process")
-    lessons = sorted(lessons, key=lambda one: (one.time, one.vehicle, one.deployment))
+    lessons = tuple(sorted(lessons, key=lambda one: (one.time, one.vehicle, one.deployment)))
     exponents = lessons[0].exponents
     parameters = _whole_range(lessons)
     family = polynomial_prior(exponents, tuple(one.name for one in parameters), REFERENCE_FIELD_NT)
@@ -212,9 +212,7 @@ def learn_fleet(
             kept = [one for k, one in enumerate(observed) if k not in changed]
             shapes = _shapes(kept, groups, mounted, exponents, parameters, basis)
             population = learn(kept, groups, shapes, variances)
-            fleet = Fleet(
-                parameters, exponents, basis, population, mounted, tuple(lessons), observed, changed
-            )
+            fleet = Fleet(parameters, exponents, basis, population, mounted, lessons, observed, changed)
             if (found := _changed_deployments(fleet, alarm)) == changed:
                 break
             changed, alarm = found, FALSE_ALARM_PROBABILITY

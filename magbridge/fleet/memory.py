@@ -244,9 +244,8 @@ def _information(calibration: Calibration, order: int) -> GaussianInformation | 
     if others or max(map(sum, term.exponents)) != order:
         return None
     size = term.size
-    family = polynomial_prior(
-        term.exponents, tuple(one.name for one in calibration.parameters), calibration.reference.field
-    )
+    names = tuple(one.name for one in calibration.parameters)
+    family = polynomial_prior(term.exponents, names, calibration.reference.field)
     to_z = np.linalg.inv(family.E * family.widths(family.centre))
     left, v = np.linalg.eigh(to_z @ calibration.covariance[:size, :size] @ to_z.T)
     left = np.maximum(left, 1e-12)

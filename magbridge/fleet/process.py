@@ -269,9 +269,8 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[l
         except KilledWorker:
             done = Done({}, f"{_named(job)}: its workers were killed (out of memory?)")
         except CancelledError as error:
-            raise PortError(
-                address, "the dask scheduler was lost; run magbridge fleet process again to do the rest"
-            ) from error
+            text = "the dask scheduler was lost; run magbridge fleet process again to do the rest"
+            raise PortError(address, text) from error
         future.release()
         catalogue.add_tables(done.tables)
         lines = [row["line"] for row in done.tables.get("failures", ())]

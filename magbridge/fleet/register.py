@@ -185,11 +185,8 @@ def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
     found: list[Path] = []
     for pattern in deployment.logs:
         if not (named := sorted(fleet.parent.glob(pattern))):
-            raise ConfigError(
-                fleet,
-                f"deployment {deployment.name}: logs",
-                f"expected files that match {pattern!r}, got none",
-            )
+            key = f"deployment {deployment.name}: logs"
+            raise ConfigError(fleet, key, f"expected files that match {pattern!r}, got none")
         found += named
     return found
 
