@@ -98,13 +98,8 @@ def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, number: signal.Sig
 @pytest.mark.parametrize("library", ["cyclopts", "typing", "__future__"])
 def test_interrupted_while_libraries_are_loaded(tmp_path: Path, library: str) -> None:
     (tmp_path / f"{library}.py").write_text("import signal; signal.raise_signal(signal.SIGINT)")
-    ended = subprocess.run(
-        [sys.executable, "-m", "magbridge", "--version"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", "magbridge", "--version"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr, ended.stdout) == (130, "magbridge: interrupted\n", "")
 
 

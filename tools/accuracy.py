@@ -98,10 +98,8 @@ def tape(flown: Glider, seed: int) -> dict[str, dict[str, object]]:
 
 def planned(seed: int) -> dict[str, float]:
     """Return the score of `auto` on a glider that performs the planned runs."""
-    runs = tuple(
-        Run(pitch=one.pitch, roll=one.roll, parameters=dict(zip(MASSES[2], one.parameters, strict=True)))
-        for one in planned_runs()
-    )
+    chosen = [(one, dict(zip(MASSES[2], one.parameters, strict=True))) for one in planned_runs()]
+    runs = tuple(Run(pitch=one.pitch, roll=one.roll, parameters=masses) for one, masses in chosen)
     scenario = load("random_glider").replace(instrument={"noise_sigma": PLANNED_NOISE_NT})
     mission = (replace(one, runs=runs) if isinstance(one, Spirals) else one for one in scenario.mission)
     flown = glider(scenario.replace(mission=tuple(mission)), seed)

@@ -91,9 +91,8 @@ def render_enums() -> str:
     ]
     messages = {message.id: message for xml in files.values() for message in xml.message}
     for _, message in sorted(messages.items()):
-        unknown = ", ".join(
-            f'"{field.name}": {value}' for field in message.ordered_fields if (value := invalid(field))
-        )
+        values = [(field.name, invalid(field)) for field in message.ordered_fields]
+        unknown = ", ".join(f'"{name}": {value}' for name, value in values if value)
         if unknown:
             lines.append(f'    "{message.name}": {{{unknown}}},')
     lines += [

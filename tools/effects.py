@@ -152,9 +152,8 @@ def bad_map(scene: Scene, size: float, rng: Generator) -> None:
     for _ in range(3):
         k = rng.integers(len(north))
         far = (north - north[k]) ** 2 + (east - east[k]) ** 2
-        scene.reference = scene.reference + size * rng.normal() * np.exp(
-            -0.5 * far / (width * rng.uniform(0.5, 1.0)) ** 2
-        )
+        height, radius = size * rng.normal(), width * rng.uniform(0.5, 1.0)
+        scene.reference = scene.reference + height * np.exp(-0.5 * far / radius**2)
 
 
 def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
@@ -308,9 +307,8 @@ def needle(scene: Scene, size: float, rng: Generator) -> None:
     """Add a payload's compass card that points north, floats level and lags in turns."""
     track = scene.track
     turned = np.radians(track.heading)
-    dragged = rng.uniform(0.1, 0.4) * (
-        turned - first_order(turned, track.step, float(rng.uniform(10.0, 40.0)))
-    )
+    share, lag = rng.uniform(0.1, 0.4), float(rng.uniform(10.0, 40.0))
+    dragged = share * (turned - first_order(turned, track.step, lag))
     level = np.column_stack([np.cos(dragged), np.sin(dragged), np.zeros_like(dragged)])
     card = rotation(track.roll, track.pitch, track.heading).apply(level, inverse=True)
     own = dipole_field(np.broadcast_to(direction(rng), card.shape), card)

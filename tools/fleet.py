@@ -66,11 +66,8 @@ class Flight(NamedTuple):
         iron = rng.normal(known.hard_iron, REFITTED["fixed iron"])
         soft = rng.normal(known.soft_iron, REFITTED["soft iron"])
         up = np.random.default_rng([self.seed, self.vehicle, OFFSET + self.number])
-        return Vehicle(
-            hard_iron=tuple(up.normal(iron, POWERED_UP)),
-            soft_iron=msgspec.convert(soft.tolist(), Matrix),
-            mass=mass,
-        )
+        hard, matrix = tuple(up.normal(iron, POWERED_UP)), msgspec.convert(soft.tolist(), Matrix)
+        return Vehicle(hard_iron=hard, soft_iron=matrix, mass=mass)
 
     def fly(self) -> Glider:
         """Return the vehicle with its calibration runs and its survey."""
@@ -154,11 +151,8 @@ def cases_of(options: argparse.Namespace) -> list[tuple[Flight, tuple[int, ...],
     learned = ", ".join(f"{name} {width:.2g}" for name, width in widths)
     show(f"learned: median of the physical widths: {learned}")
     refit = f"refit {last // options.refit_interval}"
-    return [
-        (one, tuple(options.runs), fleet.known(f"vehicle {one.vehicle}", refit))
-        for one in flights
-        if one.number == last
-    ]
+    runs, latest = tuple(options.runs), [one for one in flights if one.number == last]
+    return [(one, runs, fleet.known(f"vehicle {one.vehicle}", refit)) for one in latest]
 
 
 STUDY = Study(run, ("runs", "prior"), SCORES)

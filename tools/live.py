@@ -203,9 +203,8 @@ def fly(name: str, seed: int, length: float) -> tuple[xr.Dataset, xr.Dataset]:
         parameters=dict.fromkeys(MASSES, 0.0),
     )  # fmt: skip
     survey = Legs((straight,)) if name == "straight over rock" else CrissCross(hours=length, roll=(1.0, 2.0))
-    scenario = load("random_glider").replace(
-        world={"geology": CRUST}, mission=(Spirals(), survey), instrument={"rate": 1.0 / AGE_S}
-    )
+    world, instrument = {"geology": CRUST}, {"rate": 1.0 / AGE_S}
+    scenario = load("random_glider").replace(world=world, mission=(Spirals(), survey), instrument=instrument)
     runs, mission = segments(simulate(scenario, seed)).values()
     return runs.isel(time=slice(0, None, 2)), mission.copy()
 

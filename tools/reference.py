@@ -40,11 +40,8 @@ ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):(<code>)(?:~[\w.]*\.)?([\
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages to the files of the site."""
-    pages = Environment(
-        loader=FileSystemLoader(TOOLS / "reference_pages"),
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
-    )
+    loader = FileSystemLoader(TOOLS / "reference_pages")
+    pages = Environment(loader=loader, undefined=StrictUndefined, keep_trailing_newline=True)
     pages.filters["words"] = lambda text: " ".join(str(text).split())
     values = {
         "required": NODEFAULT, "attributes_of": attributes_of, "options_of": options_of, "DRIVERS": DRIVERS,

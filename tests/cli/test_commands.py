@@ -240,9 +240,8 @@ def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, comma
     # no further from where it is than a run may be
     assert all(run["ballast"] >= 200.0 - 0.35 * known.parameters[1].scale for run in runs)
     write(log.assign(pitch=log["pitch"] * np.nan), "flat.nc")
-    assert command.refuses(*asked, "flat.nc").startswith(
-        "flat.nc (deployment.csv): the mission has no sample with all of roll, pitch"
-    )
+    words = "flat.nc (deployment.csv): the mission has no sample with all of roll, pitch"
+    assert command.refuses(*asked, "flat.nc").startswith(words)
 
 
 def test_plan_of_a_survey_needs_no_calibration(deployment: Path, command: Command) -> None:

@@ -41,9 +41,8 @@ class Turning:
         leg = next(self._samples) // 20
         yaw = 0.7 * leg + 0.1 * self._rng.normal()
         pitch = (0.45 if leg % 2 else -0.4) + 0.05 * self._rng.normal()
-        level = np.array(
-            [0.4 * np.cos(yaw) - 0.9 * pitch, 0.4 * np.sin(yaw), 0.9 + 0.4 * pitch * np.cos(yaw)]
-        )
+        x, y = 0.4 * np.cos(yaw), 0.4 * np.sin(yaw)
+        level = np.array([x - 0.9 * pitch, y, 0.9 + pitch * x])
         x, y, z = (FIELD + self.level) * level / np.linalg.norm(level) + SHIFT + self._rng.normal(size=3)
         return float(x), float(y), float(z)
 

@@ -293,11 +293,8 @@ def test_a_bug_report_holds_what_was_seen(air: Air) -> None:
     air.feed(NOW, "STATUSTEXT", severity=3, text='sensor lost: "unplugged", again')
     air.feed(NOW, "PARAM_VALUE", param_id="MB_SETTLE_TIME", param_value=4.0, param_count=1)
     with ZipFile(BytesIO(bundle(air.state, NOW, "udpin:h:1"))) as archive:
-        tables = {
-            name: list(csv.reader(archive.read(name).decode().splitlines()))
-            for name in archive.namelist()
-            if name.endswith(".csv")
-        }
+        names = [name for name in archive.namelist() if name.endswith(".csv")]
+        tables = {name: list(csv.reader(archive.read(name).decode().splitlines())) for name in names}
         about = json.loads(archive.read("about.json"))
     assert (about["magbridge"], about["link"], about["bridge"]) == (__version__, "udpin:h:1", [1, 191])
     assert tables["texts.csv"][1][1:] == ["3", 'sensor lost: "unplugged", again']

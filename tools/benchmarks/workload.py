@@ -101,11 +101,9 @@ class Feed:
         y = HORIZONTAL * cos(0.1 * t) + noise(0.0, NOISE)
         z = VERTICAL + noise(0.0, NOISE)
         delay = 0.1 / hertz
-        return self._fluxgate.encode(
-            Reading(
-                (x, y, z), device_time=t, channel_delay=(0.0, delay, 2 * delay), temperature=12.5, supply=3.7
-            )
-        )
+        delays = 0.0, delay, 2 * delay
+        one = Reading((x, y, z), device_time=t, channel_delay=delays, temperature=12.5, supply=3.7)
+        return self._fluxgate.encode(one)
 
     def heartbeat(self) -> bytes:
         """Return the frame of the autopilot's heartbeat."""
@@ -121,9 +119,8 @@ class Feed:
             yaw = DECLINATION + atan2(-cos(0.1 * t), sin(0.1 * t))
             return self._autopilot.pack(name, time_boot_ms=boot_ms, roll=0.02 * sin(t), pitch=-0.03, yaw=yaw)
         if name == "GLOBAL_POSITION_INT":
-            return self._autopilot.pack(
-                name, time_boot_ms=boot_ms, lat=495_000_000 + number, lon=-578_000_000, alt=-50_000
-            )
+            place = {"lat": 495_000_000 + number, "lon": -578_000_000, "alt": -50_000}
+            return self._autopilot.pack(name, time_boot_ms=boot_ms, **place)
         travel = sin(t) if self._moving or t % 10.0 > 9.0 else 0.3 + 1e-4 * (number % 3)
         value = travel if name == "battpos" else 200.0 + 150.0 * travel
         return self._autopilot.pack("NAMED_VALUE_FLOAT", time_boot_ms=boot_ms, value=value, name=name)

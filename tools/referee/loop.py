@@ -198,10 +198,8 @@ def truths(flown: xr.Dataset, receiver: Receiver, seed: int) -> Iterator[tuple[f
     velocity = flown["velocity_north"].to_numpy(), flown["velocity_east"].to_numpy()
     heading, speed = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360.0, np.hypot(*velocity)
     seconds = np.arange(0.0, time[-1])
-    places = zip(
-        *(np.interp(seconds, time, flown[f"truth_{name}"]).tolist() for name in ("latitude", "longitude")),
-        strict=True,
-    )
+    track = [flown[f"truth_{name}"] for name in ("latitude", "longitude")]
+    places = zip(*(np.interp(seconds, time, one).tolist() for one in track), strict=True)
     noise = rng.normal(size=(len(seconds), 2)) * GPS_SIGMA
     depths = flown["depth"].to_numpy()
     for k, (second, place) in enumerate(zip(seconds.tolist(), places, strict=True)):
