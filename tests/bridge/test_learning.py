@@ -117,8 +117,11 @@ def test_ashore_it_learns_what_it_learned_live(flight: Flight, command: Command)
     np.testing.assert_array_equal(kept.coefficients, pipeline.learning.learner.calibration.coefficients)
 
 
-def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
-    """The command parameter returns to 0; the bridge no longer publishes the discarded calibration."""
+@pytest.mark.parametrize(("command", "accepts"), [(1.0, True), (2.0, False)])
+def test_a_station_accepts_or_forgets_freezes_and_disables(
+    tmp_path: Path, command: float, *, accepts: bool
+) -> None:
+    """The command parameter returns to 0; the bridge no longer publishes a discarded calibration."""
     pipeline = bridge(tmp_path)
     station = Codec(255, 190)
     to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
@@ -128,7 +131,8 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
         pipeline.feed(event)
     assert pipeline.learning is not None
     learner = pipeline.learning.learner
-    assert learner.calibration is not learner.first
+    initial = learner.first
+    assert learner.calibration is not initial
     beat = station.pack("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)
     pipeline.feed(Event(feed[now].time_us, Channel.LINK, beat))
 
@@ -136,14 +140,15 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
         frame = station.pack("PARAM_SET", param_id=name, param_value=value, **to)
         return received(pipeline.feed(Event(feed[now].time_us + 1, Channel.LINK, frame)))
 
-    answer = named(order("MB_LEARN_CMD", 2.0), "PARAM_VALUE")[-1]
+    answer = named(order("MB_LEARN_CMD", command), "PARAM_VALUE")[-1]
     assert (answer["param_id"], answer["param_value"]) == ("MB_LEARN_CMD", 0.0)
     assert learner.calibration is learner.first
-    assert learner.samples == 0
+    samples = learner.samples
+    assert (learner.first is not initial, samples > 0) == (accepts, accepts)
     order("MB_LEARN_FREEZE", 1.0)
     for event in feed[now + 2 :]:
         pipeline.feed(event)
-    assert learner.samples == 0
+    assert learner.samples == samples
     assert learner.frozen
     order("MB_LEARN", 0.0)
     assert not learner.enabled

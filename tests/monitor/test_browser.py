@@ -2,11 +2,12 @@
 
 import math
 import re
+import shutil
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,20 +20,27 @@ from magbridge.mavlink import Codec
 from magbridge.records import Quality
 
 pytest.importorskip("nicegui")
+from magbridge.monitor.panels import DO, TUNABLES
+
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 FLAGS = int(Quality.STALE_TELEMETRY | Quality.GAP)
 PATIENCE = 20_000
 """Time limit for the page on a busy computer, ms."""
 
-
 SPIKES = 150, 200, 250
+LEARNING = {"state": 3, "calibration_id": 0xABC, "first_calibration_id": 0xDEF, "samples": 500, "causes": 1}
+ERRORS = {"rms_first": 12.0, "rms_published": 3.0, "better": 9.0}
+ORDERS: list[float] = []
+"""Values of MB_LEARN_CMD that the page has set."""
 
 
 def feed(link: tuple[str, int], stop: threading.Event) -> None:
     """Send what two vehicles send, with three spikes, because UDP may lose one, and a mass that moves."""
-    bridges, autopilot = (Codec(1, 191), Codec(2, 191)), Codec(1, 1)
+    bridges, autopilot, ear = (Codec(1, 191), Codec(2, 191)), Codec(1, 1), Codec(0, 0)
+    command = {"param_id": "MB_LEARN_CMD", "param_value": 0.0, "param_index": 1, "param_count": 2}
     begin = time.time() - 300.0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.setblocking(False)
         for k in range(100_000):
             us = round((begin + k if k < 300 else time.time()) * 1e6)
             place = {"lat": 495_000_000 + 200 * k, "lon": -579_000_000 + 300 * k}
@@ -49,13 +57,34 @@ def feed(link: tuple[str, int], stop: threading.Event) -> None:
                 covariance = {"covariance_nn": 9e3, "covariance_ne": 4e3, "covariance_ee": 5e3}
                 frames.append(bridges[0].pack("MAG_NAVIGATION", state=2, **place, **covariance))
                 frames.append(bridges[0].pack("STATUSTEXT", severity=4, text="<b>bold</b> ballast is stale"))
-                value = {"param_id": "MB_SETTLE_TIME", "param_value": 4.0, "param_count": 1}
-                frames.append(bridges[0].pack("PARAM_VALUE", **value))
+                value = {"param_id": "MB_SETTLE_TIME", "param_value": 4.0, "param_count": 2}
+                frames += [bridges[0].pack("PARAM_VALUE", **one) for one in (value, command)]
+                frames.append(bridges[0].pack("MAG_LEARNING", **LEARNING, **ERRORS))
                 frames.append(bridges[0].pack("MAG_STATUS", uptime=k, sensor_state=1, log_state=1))
+            with suppress(BlockingIOError):
+                while data := sender.recv(65536):
+                    for message in ear.parse(data):
+                        if message.name == "PARAM_SET" and message["param_id"] == "MB_LEARN_CMD":
+                            ORDERS.append(message["param_value"])
+                            frames.append(bridges[0].pack("PARAM_VALUE", **command))
             for frame in frames:
                 sender.sendto(frame, link)
             if stop.wait(0.002 if k < 300 else 0.5):
                 return
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Return the system's Chromium; skip the test if it is missing."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    names = "chromium", "chromium-browser", "google-chrome"
+    chromium = next(filter(None, map(shutil.which, names)), None)
+    if chromium is None:
+        pytest.skip("no Chromium on this computer")
+    with playwright.sync_playwright() as player:
+        opened = player.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield opened
+        opened.close()
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +167,25 @@ def test_alarms_vehicles_and_texts(browser: Any, url: str) -> None:
         assert page.get_by_text("<b>bold</b> ballast is stale").count()  # as text, not as HTML
         page.get_by_role("button", name=re.compile("Vehicle 2, component 191")).click()
         page.get_by_text("41\u202f000.00").wait_for()
+
+
+def test_a_learned_calibration_is_accepted_or_forgotten_after_a_question(browser: Any, url: str) -> None:
+    assert DO in TUNABLES
+    with visit(browser, url) as page:
+        panel = page.get_by_role("region", name="Learning in flight")
+        panel.get_by_text("offset step").wait_for()
+        confirm = page.get_by_role("dialog")
+        for name, value in (("Accept", 1.0), ("Forget", 2.0)):
+            for answer in ("Cancel", name):
+                panel.get_by_role("button", name=name).click()
+                assert ("0.25 times (95 %: 0.23 to 0.27" in confirm.inner_text()) == (name == "Accept")
+                assert value not in ORDERS
+                confirm.get_by_role("button", name=answer).click()
+                confirm.wait_for(state="detached")
+            deadline = time.monotonic() + PATIENCE / 1000
+            while value not in ORDERS:
+                assert time.monotonic() < deadline
+                page.wait_for_timeout(100)
 
 
 def test_a_picture_and_a_report_are_handed_out(browser: Any, url: str, tmp_path: Path) -> None:
