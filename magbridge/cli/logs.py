@@ -71,14 +71,15 @@ def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.
 def _show(file: str, facts: dict[str, Any]) -> None:
     from msgspec import convert
     from rich.console import Console
+    from rich.text import Text
 
     from magbridge.logs.compasses import LogCompass
 
-    console = Console(highlight=False, soft_wrap=False)
-    console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}", soft_wrap=True)
+    console = Console(highlight=False, markup=False)  # brackets in a name are no markup
+    console.print(Text.assemble((file, "bold"), f": {summary(facts)}"), soft_wrap=True)
     for compass in facts["compasses"]:
         one = convert(compass, LogCompass)
-        console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
+        console.print(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}")
     console.print(_columns(facts, meanings=console.width >= WIDE_TERMINAL))
     console.print(_uses(facts))
     cli.complain_all(f"{file}: {hint}" for hint in facts["hints"])
@@ -114,12 +115,12 @@ def _columns(facts: dict[str, Any], *, meanings: bool) -> Table:
         every = one["changes_every_s"]
         ends = ("", "") if one["name"] in CHANNEL_TIMES else (one["lowest"], one["highest"])
         table.add_row(
-            _plain(one["name"]),
-            "" if one["unit"] == "1" else _plain(one["unit"]),
+            one["name"],
+            "" if one["unit"] == "1" else one["unit"],
             f"{one['known']:.0%}",
             *(f"{end:.6g}" if isinstance(end, float) else "" for end in ends),
             "" if every is None else f"{every:.3g} s",
-            *([_plain(one["meaning"])] if meanings and one["meaning"] != one["name"] else []),
+            *([one["meaning"]] if meanings and one["meaning"] != one["name"] else []),
         )
     return table
 
@@ -136,13 +137,6 @@ def _table(*names: str) -> Table:
     from rich.table import Table
 
     return Table(*names, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-
-
-def _plain(text: str) -> str:
-    """Return `text` with its brackets escaped, so that rich does not read them as markup."""
-    from rich.markup import escape
-
-    return escape(text)
 
 
 @cli.command("convert FILE... -o FILE [OPTIONS]")

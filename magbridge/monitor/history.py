@@ -50,13 +50,9 @@ class Point:
 
 
 class Series:
-    """Time series of a quantity at the resolutions of `TIERS`.
-
-    `latest` is the last value (NaN before the first), `added` the number of values added.
-    """
+    """Time series of a quantity at the resolutions of `TIERS`."""
 
     def __init__(self) -> None:
-        self.latest, self.added = float("nan"), 0
         points = {name: round(window / width) + 1 for name, (window, width) in TIERS.items()}
         self._tiers = {name: deque[Point](maxlen=count) for name, count in points.items()}
 
@@ -69,7 +65,6 @@ class Series:
             return
         value = max(-MAX_PLOTTED_VALUE, min(value, MAX_PLOTTED_VALUE))
         two_sigma = min(abs(two_sigma), MAX_PLOTTED_VALUE)
-        self.latest, self.added = value, self.added + 1
         for name, tier in self._tiers.items():
             width = TIERS[name][1]
             begin = time // width * width

@@ -237,9 +237,10 @@ def test_masses_and_temperature_of_the_same_vehicle_are_kept(air: Air) -> None:
     for k in range(100):  # bounded, whatever is named
         air.give(Codec(1, 1).pack("NAMED_VALUE_FLOAT", name=f"n{k}", value=k), NOW + 1)
     telemetry = air.state.telemetry
-    assert telemetry[TEMPERATURE_SERIES].latest == 7.5
-    assert telemetry["battpos"].latest == pytest.approx(0.4)
-    assert telemetry["battpos"].points("10 min")[0].time == NOW + 1
+    assert telemetry[TEMPERATURE_SERIES].points("10 min")[-1].mean == 7.5
+    (battpos,) = telemetry["battpos"].points("10 min")
+    assert battpos.mean == pytest.approx(0.4)
+    assert battpos.time == NOW + 1
     assert len(telemetry) == 12
 
 
@@ -434,7 +435,7 @@ def test_every_sensor_has_a_row_with_its_disagreement(air: Air) -> None:
     assert (tail["Total field"][0], tail["Flags"][0]) == ("52\u202f300.00 ± 2.00", "implausible")
     assert third["Minus flux"] == ("+1.00", True)
     assert state.field["total_field"] == 52_000.0
-    assert state.telemetry["Sensor 1: total field, nT"].latest == 52_300.0
+    assert state.telemetry["Sensor 1: total field, nT"].points("10 min")[-1].most == 52_300.0
     assert conditions(state, now)["sensor 1 implausible"].startswith("Sensor tail: It cannot be")
     air.feed(now, "MAG_SENSOR", sensor_id=1, state=3, name="tail")
     assert conditions(state, now + 0.1)["sensor 1"] == "Sensor tail: lost"
