@@ -490,8 +490,9 @@ class Counts:
 def main() -> int:
     """Fuzz each target in turn; print the outcomes and return the exit code."""
     kinds = ["bytes", "file", "events"]
-    limits = {"n": 10_000, "seconds": float("inf")}
-    chosen = command_line(__doc__, TARGETS, kind=kinds, **limits, seed=0, o=Path("fuzz"))
+    chosen = command_line(
+        __doc__, TARGETS, kind=kinds, n=10_000, seconds=float("inf"), seed=0, o=Path("fuzz")
+    )
     shown = table("Fuzzing", "target", "tried", "read", "refused", "faults", "slowest, s", left=("target",))
     faults = 0
     for name in (name for name in chosen.names if TARGETS[name].kind in chosen.kind):

@@ -185,7 +185,7 @@ SUMMARY = Study(run, ("foreign",), {name: Column(source, np.sum, ".0f") for name
 
 
 if __name__ == "__main__":
-    options = {"logs": list(VEHICLES), "effects": list(EFFECTS), "snr": 12.0, "data": DATA}
-    rows = STUDY.main(__doc__, seeds=1, first=0, **options)
+    logs, effects = list(VEHICLES), list(EFFECTS)
+    rows = STUDY.main(__doc__, seeds=1, first=0, logs=logs, effects=effects, snr=12.0, data=DATA)
     judged = {"foreign": rows["effect"].isin(FOREIGN), "a_name": rows["named"] != "none"}
     show(SUMMARY.table("Number of cases", rows.assign(**judged, worse=rows["real"] > 1.02)))
