@@ -382,10 +382,7 @@ def _named_sensors(sensor: Any) -> dict[str, Any]:
 
 
 def _numbered(sensors: list[Sensor], path: Path) -> list[Sensor]:
-    """Assign missing ids and return the sensors in the order of their ids.
-
-    ConfigError: there are too many sensors, ids or names are repeated, or no sensor has the id 0.
-    """
+    """Assign missing ids and return the sensors in the order of their ids."""
     if len(sensors) > MAX_BRIDGE_SENSORS:
         raise ConfigError(path, "sensor", f"expected at most {MAX_BRIDGE_SENSORS} tables, got {len(sensors)}")
     names = [one.name for one in sensors]

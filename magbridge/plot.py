@@ -89,10 +89,7 @@ def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
 
 
 def _corrected_panel(axis: Axes, log: xr.Dataset, name: str) -> None:
-    """Draw a column of a corrected log against time, with flagged samples and the 2-sigma band of a field.
-
-    `name` is ``total_field``, ``anomaly``, ``total_field_sigma`` or ``level_sigma``.
-    """
+    """Draw a column of a corrected log against time, with flagged samples and the 2-sigma band of a field."""
     log = log.isel(time=slice(None, None, max(1, log.sizes["time"] // DRAWN_SAMPLES)))
     time = np.array(log["time"].to_numpy() * 1e6, "datetime64[us]")
     values, sigma = log[name].to_numpy(), log["total_field_sigma"].to_numpy()

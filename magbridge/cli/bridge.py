@@ -100,10 +100,7 @@ def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json
 
 
 def _check(config: Path, *, live: bool, json: bool) -> None:
-    """Print every fault of a configuration, and with `live` the arriving messages.
-
-    FailedResult: the bridge would not start.
-    """
+    """Print every fault of a configuration, and with `live` the arriving messages."""
     from magbridge.bridge.check import findings
 
     found, arriving = findings(config), dict[str, Any]()

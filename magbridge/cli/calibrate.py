@@ -372,10 +372,7 @@ def _with_scalar(
 
 
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
-    """Return a log with its mean reading as the reference field, and the 1-sigma of the reference, nT.
-
-    WrongUse: the log has positions or reference_field.
-    """
+    """Return a log with its mean reading as the reference field, and the 1-sigma of the reference, nT."""
     from magbridge.columns import counts_from_boot
     from magbridge.estimation.priors import GAIN_SIGMA
     from magbridge.field.reference import about_mean
@@ -391,10 +388,7 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
 
 
 def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
-    """Calibrate every compass of the logs; return number -> values and text of the result.
-
-    DataError: no compass could be calibrated.
-    """
+    """Calibrate every compass of the logs; return number -> values and text of the result."""
     from magbridge.logs import read_each
     from magbridge.logs.compasses import compasses_in
 

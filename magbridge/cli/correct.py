@@ -112,14 +112,11 @@ def correct(
 def _scalar_too(
     pieces: Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]], known: mb.Calibration
 ) -> Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]]:
-    """Yield (log, corrected, correction) of each piece, with the compensated scalar if calibrated.
-
-    With a scalar sensor all pieces are joined, because its compensation needs the range of each channel over
-    the whole log.
-    """
+    """Yield (log, corrected, correction) of each piece, with the compensated scalar if calibrated."""
     if not known.sensors:
         yield from pieces
         return
+    # joined, because the compensation needs the range of each channel over the whole log
     from magbridge.calibration.fitting.scalar_log import with_scalar
     from magbridge.logs.deployment import join
 
@@ -129,10 +126,7 @@ def _scalar_too(
 
 
 def _known(file: Path | None, config: Path | None) -> tuple[mb.Calibration, Config]:
-    """Return the first calibration and the settings of the bridge; without `config`, default settings.
-
-    ConfigError: the configuration has no ``[learning]``, or neither a calibration nor a prior.
-    """
+    """Return the first calibration and the settings of the bridge; without `config`, default settings."""
     from magbridge.bridge.learning import first_calibration
     from magbridge.config import Config, Learning, Link, Sensor
     from magbridge.config import load as load_config
@@ -157,10 +151,7 @@ def _corrected(
     file: Path,
     learn: Config | None,
 ) -> Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]]:
-    """Yield each piece of a log, its corrected samples, and the correction.
-
-    DataError: no row of the log has all channels.
-    """
+    """Yield each piece of a log, its corrected samples, and the correction."""
     from magbridge.field.reference import missing_anomaly
     from magbridge.rows import correct_rows
 
@@ -242,11 +233,7 @@ def _from_true_north(log: xr.Dataset, corrected: xr.Dataset) -> xr.DataArray:
 
 
 def _counts(corrected: list[xr.Dataset], rows: int, source: Path) -> tuple[dict[str, Any], str]:
-    """Return the counts of corrected samples and of their flags, for JSON and as a sentence.
-
-    `corrected` are the pieces of a log that had `rows` rows, some of them without a reading. If most total
-    fields are outside the Earth's range, a warning about the calibration `source` is printed to stderr.
-    """
+    """Return the counts of the samples and flags of a log of `rows` rows, for JSON and as a sentence."""
     import numpy as np
 
     from magbridge.field.reference import MAIN_FIELD_RANGE_NT

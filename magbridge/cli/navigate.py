@@ -112,10 +112,7 @@ def _with_total_field(
     heading_reference: cli.Heading,
     reading: cli.ReadingOptions,
 ) -> xr.Dataset:
-    """Return the logs as one, corrected with `known`, the calibration of the file `calibration`, if given.
-
-    WrongUse: there is neither a calibration nor a column ``total_field``.
-    """
+    """Return the logs as one, corrected with `known`, the calibration of the file `calibration`, if given."""
     from magbridge.columns import CHANNELS
     from magbridge.rows import correct_rows
 
@@ -216,10 +213,7 @@ def _continued(
 
 
 def _options(config: Path | None) -> NavigationOptions | None:
-    """Return ``[navigation.options]`` of a configuration; None without `config`.
-
-    ConfigError: the table is missing.
-    """
+    """Return ``[navigation.options]`` of a configuration; None without `config`."""
     from magbridge.navigate import NavigationOptions
     from magbridge.toml import convert, load_toml
 

@@ -220,10 +220,7 @@ def learn_fleet(
 
 
 def _changed_deployments(fleet: Fleet, alarm: float) -> frozenset[int]:
-    """Return the indices of the deployments that differ from their vehicle's earlier unchanged ones.
-
-    An unchanged deployment is among them with the probability `alarm`.
-    """
+    """Return the indices of the deployments that differ from their vehicle's earlier unchanged ones."""
     past: dict[str, list[Observed]] = {}
     found = set[int]()
     for k, (lesson, seen) in enumerate(zip(fleet.lessons, fleet.observed, strict=True)):
@@ -378,10 +375,7 @@ def _compare(
     earlier: Sequence[Lesson] = (),
     alarm: float = FALSE_ALARM_PROBABILITY,
 ) -> Comparison:
-    """Compare a deployment with the prediction `known`, and its noise and refit with `earlier` deployments.
-
-    `alarm` is the probability of a false alarm.
-    """
+    """Compare a deployment with the prediction `known`, and its noise and refit with `earlier` ones."""
     names, places = _looked_at(fleet)
     evidence = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
     S = known.covariance
@@ -420,10 +414,7 @@ def _cause(name: str, refitted: bool) -> str:
 
 
 def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
-    """Return names and indices of the monitored coefficients.
-
-    They are the hard iron, its change with each mass, and the soft iron with the gains of the axes.
-    """
+    """Return names and indices of the hard iron, its change with each mass, and soft iron with gains."""
     names = [f"{FIXED}, {axis}" for axis in "xyz"]
     places = [6, 7, 8]
     for m, powers in enumerate(fleet.exponents):

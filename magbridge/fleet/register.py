@@ -197,10 +197,7 @@ def is_file_name(name: str) -> bool:
 
 
 def _check_name(name: str, kind: str) -> None:
-    """Check that `name` is usable as a folder's name, because results are stored in a folder of that name.
-
-    WrongUse: it is not.
-    """
+    """Check that `name` is usable as a folder's name, because results are stored in such a folder."""
     if not is_file_name(name):
         raise WrongUse(f"{name!r}: expected {kind}'s name without slashes, not beginning with a dot")
 
