@@ -239,10 +239,7 @@ class Aligner:
             track.update(time_us, value, self.settings.moving_rate, since_us)
 
     def reading(self, reading: Reading, time_us: int) -> Sample:
-        """Return the sample that results from a reading and the telemetry.
-
-        `time_us` (µs) is the host's time of ``reading.device_time``.
-        """
+        """Return the sample of a reading; `time_us` (µs) is the host's time of ``reading.device_time``."""
         settings = self.settings
         cycle, delay, restarted = reading.power_cycle, reading.channel_delay, reading.restarted
         if cycle is not None:

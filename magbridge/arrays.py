@@ -18,10 +18,7 @@ IntArray = NDArray[np.int64]
 
 
 def plain(value: object) -> object:
-    """Convert a numpy number to a Python number, because msgspec encodes only Python numbers.
-
-    NotImplementedError: `value` is not a numpy number.
-    """
+    """Convert a numpy number to a Python number for msgspec; NotImplementedError: it is not a number."""
     if isinstance(value, np.generic):
         return value.item()
     raise NotImplementedError(f"{type(value).__name__} cannot be encoded")

@@ -152,10 +152,7 @@ def absent(name: str, present: Iterable[str]) -> str:
 
 
 def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
-    """Check that a deployment has all columns in `names`.
-
-    FormatError: a column is missing; the message names the file, the column, and the present columns.
-    """
+    """Check that a deployment has all columns in `names`; FormatError: names the first that is missing."""
     for name in names:
         if name not in deployment:
             source = deployment.attrs.get("source", "the deployment")
@@ -165,10 +162,7 @@ def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
 
 
 def require_units(deployment: xr.Dataset, units: Mapping[str, str]) -> None:
-    """Check that columns of a deployment have the units in `units` (column -> unit), if they declare one.
-
-    FormatError: a column has another unit; the message names the file, the column, and both units.
-    """
+    """Check that columns have the `units` (column -> unit) if they declare one; FormatError: names one."""
     for name, unit in units.items():
         given = str(deployment[name].attrs.get("units", "")) if name in deployment else ""
         if not may_be(given, unit):

@@ -120,10 +120,7 @@ MAX_DELAY_S = 600.0
 
 
 class Telemetry(Table, frozen=True):
-    """``[telemetry.NAME]``: a field of a MAVLink message that becomes the parameter NAME.
-
-    ``value = scale * message.field + offset``.
-    """
+    """``[telemetry.NAME]``: a field of a MAVLink message that becomes the parameter NAME."""
 
     message: str
     """Name of the MAVLink message, such as ``NAMED_VALUE_FLOAT``."""
@@ -298,10 +295,7 @@ class Config(Table, frozen=True):
         return self.path.parent / Path(name).expanduser()
 
     def read(self, key: str, reader: Callable[[Path], T]) -> T | None:
-        """Return what `reader` reads from the file of a `key` of :attr:`files`; None without this key.
-
-        ConfigError: `reader` raises a DataError.
-        """
+        """Return what `reader` reads from the file of a `key` of :attr:`files`; ConfigError: it cannot."""
         if (name := self.files[key]) is None:
             return None
         try:
@@ -326,10 +320,7 @@ def load(path: str | Path) -> Config:
 
 
 def parse(table: dict[str, Any], path: Path) -> Config:
-    """Convert the table of a ``bridge.toml`` to a configuration, without its digest.
-
-    ConfigError: a key is unknown or missing, or a value has the wrong type or range.
-    """
+    """Convert the table of a ``bridge.toml`` to settings without digest; ConfigError: as :func:`load`."""
     for reserved in ("path", "digest", "more_sensors"):
         if reserved in table:
             raise ConfigError(path, reserved, "unknown key")

@@ -107,10 +107,7 @@ class Correction:
         return self.corrector.calibration
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
-        """Apply the alignment settings that a bridge's log declares in its attributes `attrs`.
-
-        ConfigError: a setting is out of range.
-        """
+        """Apply the alignment settings in the attributes of a bridge's log; ConfigError: out of range."""
         declared = {key: float(value) for key, value in attrs.items() if isinstance(value, (int, float))}
         names = [key for key in Align.__struct_fields__ if f"align.{key}" in declared]
         if names and not self._given:

@@ -100,10 +100,7 @@ def _moments(source: str, time: xr.DataArray) -> xr.DataArray:
 
 
 def conversion(source: str | Path, name: str, unit: str) -> float:
-    """Return the factor from a column's declared unit to its standard unit.
-
-    FormatError: the unit is of another quantity.
-    """
+    """Return the factor from a column's declared unit to its standard unit; FormatError: there is none."""
     scale = factor(unit, name)
     if scale is None:
         raise FormatError(source, f"expected {COLUMNS[name].units}, not {unit}", column=name)

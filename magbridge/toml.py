@@ -65,10 +65,7 @@ def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Pat
 
 
 def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
-    """Convert a table or a value of a TOML file to `kind`, a struct or a plain type.
-
-    ConfigError: names the key (`prefix` before it) and the expected value.
-    """
+    """Convert a table or value of a TOML file to `kind`; ConfigError: names the key, after `prefix`."""
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:

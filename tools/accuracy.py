@@ -108,10 +108,7 @@ def planned(seed: int) -> dict[str, float]:
 
 @cache
 def planned_runs() -> tuple[PlannedRun, ...]:
-    """Return as many runs as in Table 1, chosen from the prior before any data exist.
-
-    They have at most the paper's bank, to either side, and the vehicle's trim.
-    """
+    """Return as many runs as in Table 1, with its bank and trim, chosen before any data exist."""
     parts = segments(simulate(load("random_glider"), 0))
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
     field = float(runs.reference.mean())

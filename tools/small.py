@@ -61,10 +61,7 @@ def polynomial(
     field_nt: float = 50_000.0,
     **more: Any,
 ) -> Calibration:
-    """Return a polynomial calibration; the number of coefficients determines its order.
-
-    Each coefficient has the `variance`, nT²; `more` are further fields of the calibration.
-    """
+    """Return a polynomial calibration with this `variance` (nT²) of each coefficient, and `more` fields."""
     size = len(coefficients)
     orders = (full_order(len(parameters), order) for order in count())
     exponents = next(one for one in orders if 9 * len(one) >= size)

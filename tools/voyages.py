@@ -292,10 +292,7 @@ def misled(kind: Map, seed: int) -> tuple[float, float]:
 
 
 def dived(seed: int) -> Iterator[Row]:
-    """Navigate the demo's deployment in the true field, with the map as it is and continued to the depth.
-
-    Yield the name of the map and the score of :func:`track_score` for each of the two maps.
-    """
+    """Yield the scores of the demo's deployment with the map as it is, and continued to the depth."""
     scenario = load("demo")
     grid, log = Twin.draw(scenario, seed).anomaly_map(), simulate(scenario, seed)
     log = log.assign(total_field=log["truth_total_field"])

@@ -240,10 +240,7 @@ def monitor(
 
 
 def speed_of(text: str) -> float:
-    """Return the replay speed as a multiple of real time, infinite for ``max``.
-
-    WrongUse: `text` is neither ``max`` nor a number of at least :data:`MIN_REPLAY_SPEED`.
-    """
+    """Return the replay speed over real time, infinite for ``max``; WrongUse: it is not a positive number."""
     try:
         speed = inf if text == "max" else float(text)
     except ValueError:

@@ -105,10 +105,7 @@ class ReferenceOptions:
     heading_reference: cli.Heading = None
 
     def apply(self, deployment: xr.Dataset, scalar: str) -> tuple[xr.Dataset, float | None]:
-        """Return the log with the requested reference field, and the 1-sigma of its constant error, nT.
-
-        The 1-sigma is None if the default of the fit applies.
-        """
+        """Return the log with its reference field, and the 1-sigma of its level, nT (None: default)."""
         if self.reference == "mean":
             return _about_mean(deployment, self.site_bias)
         if self.reference == "scalar":

@@ -315,10 +315,7 @@ class FailedResult(DataError):
 
 
 def print_result(result: Mapping[str, Any], sentence: str, as_json: bool, file: Path | None = None) -> None:
-    """Print the result to stdout: as one JSON object if `as_json`, else the text `sentence`.
-
-    Both begin with the written `file` if it is given.
-    """
+    """Print the result, with the written `file` if given: as JSON if `as_json`, else the text `sentence`."""
     from magbridge.arrays import plain
 
     if file is not None:

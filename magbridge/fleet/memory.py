@@ -139,10 +139,7 @@ def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
 
 
 def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
-    """Return vehicle and refit of the logs with the SHA-256 `digests`.
-
-    WrongUse: the logs are not in the catalogue, or belong to several vehicles.
-    """
+    """Return vehicle and refit of the logs with the SHA-256 `digests`; WrongUse: not those of one vehicle."""
     wanted = set(digests)
     rows = [row for row in current_files(catalogue.rows("files")) if row["sha256"] in wanted]
     found = {(row["vehicle"], row["refit"]) for row in rows}

@@ -55,10 +55,7 @@ class Done(NamedTuple):
 
 
 def work(job: Job, results: Path) -> Done:
-    """Read, check, calibrate and correct a deployment; also diagnose and map it if the job requests this.
-
-    Corrected logs and maps are written to the folder `results`.
-    """
+    """Process a deployment as its job requests; write corrected logs and maps to the folder `results`."""
     tables: dict[str, list[Row]] = defaultdict(list)
     try:
         with threadpool_limits(1, "blas"):
@@ -167,10 +164,7 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
 
 
 def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list[Row], list[Row]]:
-    """Diagnose a deployment; return its rows for the tables ``findings`` and ``improvements``.
-
-    Without a finding, the only row of ``findings`` has an empty cause.
-    """
+    """Diagnose a deployment; return its ``findings`` (an empty cause if none) and ``improvements``."""
     found = diagnose([log], calibration, training_logs=[log]).diagnosis
     nothing: Row = {**job.mark, "verdict": found.verdict}
     if not found.findings:

@@ -68,10 +68,7 @@ class _RegisteredFile(Table, frozen=True):
 
 
 def read_fleet(path: Path) -> dict[str, Vehicle]:
-    """Read a fleet.toml and return its vehicles by name.
-
-    ConfigError: the file, a key or a type is not as expected.
-    """
+    """Read a fleet.toml and return its vehicles by name; ConfigError: a key or a type is not as expected."""
     table = load_toml(path)
     check_entries(table, "vehicle", Vehicle, path)
     return convert(table, _RegisteredFile, path).vehicle
@@ -91,10 +88,7 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
 
 
 def masses(row: Row) -> dict[str, Mounting]:
-    """Return the mounting of each mass of a vehicle, by the column with the position of the mass.
-
-    FormatError: the catalogue's text is not a table of positions.
-    """
+    """Return the mounting of each mass of a vehicle by its column; FormatError: it is not such a table."""
     try:
         return msgspec.json.decode(row["mass"], type=dict[str, Mounting])
     except msgspec.DecodeError as error:
@@ -178,10 +172,7 @@ def current_files(rows: Iterable[Row]) -> list[Row]:
 
 
 def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
-    """Return the files that match the patterns of a deployment, relative to the fleet.toml `fleet`.
-
-    ConfigError: a pattern does not match any file.
-    """
+    """Return the files of a deployment's patterns, relative to `fleet`; ConfigError: one has no file."""
     found: list[Path] = []
     for pattern in deployment.logs:
         if not (named := sorted(fleet.parent.glob(pattern))):

@@ -55,10 +55,7 @@ def chart_options(kind: str, name: str) -> dict[str, Any]:
 
 
 def drawn(points: Sequence[Point], tier: str) -> tuple[list[list[Any]], dict[str, float]]:
-    """Return the data of lower edge, band width, mean and spikes, and the limits of the y axis.
-
-    The lists and the limits are empty without points.
-    """
+    """Return lower edge, band width, mean, spikes, and the limits of the y axis; all empty without points."""
     if not points:
         return [[], [], [], []], {}
     ends = axis_range(points)
@@ -120,10 +117,7 @@ class Background:
 
 
 def read_background(path: Path) -> Background:
-    """Read the anomaly grid of a file and return it as a picture.
-
-    FormatError: the file is not a grid.
-    """
+    """Read the anomaly grid of a file and return it as a picture; FormatError: the file is not a grid."""
     import numpy as np  # noqa: PLC0415 - most pages show no grid
     from matplotlib.image import imsave  # noqa: PLC0415 - as above
 
@@ -166,10 +160,7 @@ def ellipse(place: TrackPoint) -> list[tuple[float, float]]:
 
 
 def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, float] | None:
-    """Return west, south, east and north limits (deg) of a map of shape `ASPECT` around the positions.
-
-    `places` are (longitude, latitude), deg. The result is None without any place.
-    """
+    """Return west, south, east, north (deg) of a map around (longitude, latitude), deg; None without any."""
     points = list(places)
     if not points:
         return None

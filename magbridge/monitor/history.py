@@ -154,11 +154,7 @@ class Alarm:
 
     @property
     def cause(self) -> str:
-        """Cause of the alarm, by which the page groups alarms.
-
-        The cause is a key of :data:`ALARM_CAUSES` if one matches. Else it is the words of a STATUSTEXT before
-        its first colon, or the alarm's key itself.
-        """
+        """Cause of the alarm: a key of :data:`ALARM_CAUSES`, else a text's first words, else its key."""
         kind, colon, text = self.key.partition(": ")
         words = text.split() if colon and kind == "text" else [self.key]
         for cause, names in ALARM_CAUSES.items():

@@ -31,10 +31,7 @@ LIBRARIES = ("nicegui", "numpy", "msgspec", "pyserial")
 
 
 def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
-    """Return the ZIP file of a bug report: versions, health, texts, alarms, parameters, last samples.
-
-    `now_s` is the time of the receiver's monotonic clock, s; `link` is the name of the receiving port.
-    """
+    """Return the ZIP file of a bug report at `now_s`, s of the monotonic clock; `link` is the port's name."""
     wall = time.time() - now_s
 
     def utc(moment: float) -> str:

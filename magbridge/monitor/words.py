@@ -115,11 +115,7 @@ def heading_text(field: dict[str, Any]) -> str:
 
 
 def sensor_rows(state: BridgeState, now_s: float) -> dict[int, dict[str, tuple[str, bool]]]:
-    """Return the items of each of several sensors: number -> name -> text, and True if it is normal.
-
-    The items are the total field, its difference from the first sensor's total field (both with 2 sigma, nT;
-    significant differences are not normal), the state of the port with the sample rate, and the flags.
-    """
+    """Return the items of each of several sensors: number -> name -> text, and True if it is normal."""
     if len(state.sensors) < 2:
         return {}
     first = next(iter(state.sensors.values()))

@@ -84,10 +84,7 @@ def table_1(noise: float = 1.0) -> Observations:
 
 
 def fit_many(count: int) -> tuple[float, float]:
-    """Return the processor time (s) and the memory (MB) of a fit of `count` samples.
-
-    The samples are the runs of Table 1 repeated, each time with new noise of 1 nT.
-    """
+    """Return processor time (s) and memory (MB) of a fit of `count` samples: Table 1 with noise of 1 nT."""
     runs = table_1(0.0)
     rng = np.random.default_rng(2)
     pick = np.arange(count) % len(runs)
@@ -132,10 +129,7 @@ def diagnose_survey(folder: Path) -> tuple[float, int, float]:
 
 
 def write_survey(folder: Path, hours: float, size: float) -> None:
-    """Write a glider's survey of `hours` and its calibration.
-
-    `size` (nT/degC) is the slope of an added offset proportional to the logged temperature.
-    """
+    """Write a glider's survey of `hours` and its calibration, with an offset of `size`, nT/degC."""
     scenario = load_scenario("random_glider")
     survey = CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1)
     scenario = scenario.replace(mission=(scenario.mission[0], survey))
