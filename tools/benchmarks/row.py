@@ -56,10 +56,7 @@ def processor_time(work: Callable[[], object]) -> float:
 
 
 def alternating(repetitions: int, *measures: Callable[[], float]) -> list[list[float]]:
-    """Take measurements in turn, so that a busy computer slows all; return the values of each.
-
-    The first repetition, which fills the caches, is left out.
-    """
+    """Return the values of measurements taken in turn, without the first ones, which fill the caches."""
     rows = [[measure() for measure in measures] for _ in range(repetitions + 1)]
     return [list(values) for values in zip(*rows[1:], strict=True)]
 

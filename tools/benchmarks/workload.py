@@ -67,11 +67,7 @@ def write_config(
 
 
 class Feed:
-    """Generator of the bytes that a digitizer and an autopilot send.
-
-    The masses are always `moving`; else they are at rest nine seconds of ten, and their telemetry jitters in
-    its last digit.
-    """
+    """Source of a digitizer's and an autopilot's bytes; unless `moving`, masses rest 9 s of 10."""
 
     def __init__(self, *, moving: bool = False) -> None:
         self._moving = moving

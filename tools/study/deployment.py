@@ -180,10 +180,7 @@ def project(X: FloatArray, A: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def size_of(name: str, d: FloatArray, A: FloatArray, covariance: FloatArray) -> float:
-    """Return the signal-to-noise ratio of a signature d (n,): its norm with the calibration projected out.
-
-    For outliers, which are independent, the ratio is that of the largest outlier.
-    """
+    """Return the S/N of a signature d (n,) with the calibration projected out; of outliers, the largest."""
     left = project(d[:, None], A, covariance)[:, 0]
     if name == "outliers":
         return float(np.abs(left).max())
