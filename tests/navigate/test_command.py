@@ -32,14 +32,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options:
     path = tmp_path_factory.mktemp("navigate")
     ds = track_over(grid, options, 6, hours=2.0)
     field = ds["total_field"].to_numpy()
-    unit = {"units": "nT"}
-    channels = {"mag_x": 0.6 * field, "mag_y": 0.0 * field, "mag_z": 0.8 * field}
     log = ds.drop_vars(["total_field", "total_field_sigma", "away_north", "away_east"]).assign(
-        {name: ("time", values, unit) for name, values in channels.items()}
+        {f"mag_{k}": ("time", c * field, {"units": "nT"}) for k, c in (("x", 0.6), ("y", 0.0), ("z", 0.8))}
     )
     # GPS at the start: the dead-reckoned position, which is the truth less its error
-    first = {"gps_latitude": 49.5, "gps_longitude": -57.9}
-    for name, value in first.items():
+    for name, value in (("gps_latitude", 49.5), ("gps_longitude", -57.9)):
         log[name] = xr.full_like(log["depth"], np.nan)
         log[name][0] = value
     write(log, path / "log.nc")
@@ -137,9 +134,6 @@ def test_a_bound_takes_the_log_s_own_rate(command: Command, here: Path) -> None:
     """The interval is that of the log, of the calibration, or 4 s, unless an option states it."""
     slow = read([Path("log.nc")]).isel(time=slice(None, None, 5))
     write(slow.assign(latitude=slow["truth_latitude"], longitude=slow["truth_longitude"]), "slow.nc")
-    for words, every in (
-        (("slow.nc",), 20.0),
-        (("plan.csv",), 4.0),
-        (("plan.csv", "--sample-interval", "0.2"), 0.2),
-    ):
-        assert json.loads(command(*BOUND, *words, "--json").out)["sample_interval_s"] == pytest.approx(every)
+    for words, every in (("slow.nc", 20.0), ("plan.csv", 4.0), ("plan.csv --sample-interval 0.2", 0.2)):
+        facts = json.loads(command(*BOUND, *words.split(), "--json").out)
+        assert facts["sample_interval_s"] == pytest.approx(every)

@@ -5,6 +5,7 @@ from math import atan2, cos, degrees, log, radians, sin, sqrt
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from scipy.spatial.transform import Rotation
 from voyages import OUTSIDE, PLACE, Map, blocks, misled, sail, track_over
 
 from magbridge.calibration.model import rotation_matrix
@@ -139,11 +140,8 @@ def alike() -> AnomalyGrid:
     per_latitude, per_longitude = metres_per_degree(PLACE[0])
     metres = np.arange(-6_000.0, 6_001.0, 50.0)
     waves = np.cos(2.0 * np.pi * metres / PERIOD)
-    return AnomalyGrid(
-        PLACE[1] + metres / per_longitude,
-        PLACE[0] + metres / per_latitude,
-        40.0 * (waves[:, None] + waves[None, :]),
-    )
+    places = PLACE[1] + metres / per_longitude, PLACE[0] + metres / per_latitude
+    return AnomalyGrid(*places, 40.0 * (waves[:, None] + waves[None, :]))
 
 
 def test_indistinguishable_places_are_never_valid(alike: AnomalyGrid, options: NavigationOptions) -> None:
@@ -202,11 +200,8 @@ def flown(*, wrong: bool) -> tuple[float, float, float]:
         bias = radians(3.0) * np.array([1.0, -1.0, 2.0]) if bad else np.zeros(3)
         tilt = rotation(radians(15.0), radians(-10.0), radians(40.0)) if bad else np.eye(3)
         claimed = tilt @ attitude
-        angles = (
-            atan2(claimed[2, 1], claimed[2, 2]),
-            -np.arcsin(claimed[2, 0]),
-            atan2(claimed[1, 0], claimed[0, 0]),
-        )
+        yaw, pitch, roll = Rotation.from_matrix(claimed).as_euler("ZYX")
+        angles = roll, pitch, yaw
         later = rates + np.array([0.2 * cos(time), -0.07 * sin(0.7 * time), 0.03 * cos(0.2 * time)]) * 0.05
         filter_.rotate(time, time, angles, later + bias, vouched=not bad)
         filter_.gyro(time + 0.05, later)
