@@ -34,10 +34,8 @@ def storm(here: Path) -> Path:
     field = earth * (1.0 + varied(time) / np.linalg.norm(earth))[:, None]
     body = Rotation.random(len(time), rng=np.random.default_rng(3)).apply(field) + OFFSET
     place = {"latitude": np.full(400, 45.0), "longitude": np.full(400, -63.0), "depth": np.zeros(400)}
-    write(
-        deployment("made", time, {f"mag_{axis}": body[:, k] for k, axis in enumerate("xyz")} | place),
-        "log.csv",
-    )
+    axes = {f"mag_{axis}": body[:, k] for k, axis in enumerate("xyz")}
+    write(deployment("made", time, axes | place), "log.csv")
     lines = [" Format                 IAGA-2002|", " IAGA Code              MDE|",
              "DATE       TIME         DOY     MDEX      MDEY      MDEZ      MDEF   |"]  # fmt: skip
     for t in START - 600.0 + 60.0 * np.arange(230.0):
@@ -109,9 +107,8 @@ def test_the_level_of_a_base_station_is_uncertain(hours: float) -> None:
         phases = rng.uniform(0.0, 2.0 * np.pi, 2)
         variation = 20.0 * np.sin(2.0 * np.pi * time / 86_400.0 + phases[0])
         variation += 15.0 * np.sin(2.0 * np.pi * time / 18_000.0 + phases[1])
-        base = deployment(
-            "base", time, {"total_field": 50_000.0 + variation + rng.normal(0.0, 0.2, time.size)}
-        )
+        field = 50_000.0 + variation + rng.normal(0.0, 0.2, time.size)
+        base = deployment("base", time, {"total_field": field})
         (found,) = with_daily_variation([log], base)
         off.append(float(np.mean(found["daily_variation"].to_numpy() - variation)))
         sigma.append(corrected_by_others(found).level_sigma)
@@ -123,14 +120,10 @@ def test_the_level_of_a_base_station_is_uncertain(hours: float) -> None:
 
 def test_whole_days_of_a_base_station_determine_its_level() -> None:
     time = START + np.arange(0.0, 20 * 86_400.0, 300.0)
-    field = (
-        50_000.0
-        + 20.0 * np.sin(2.0 * np.pi * time / 86_400.0)
-        + np.random.default_rng(0).normal(size=time.size)
-    )
-    (found,) = with_daily_variation(
-        [deployment("log", time, {})], deployment("base", time, {"total_field": field})
-    )
+    field = 50_000.0 + 20.0 * np.sin(2.0 * np.pi * time / 86_400.0)
+    field += np.random.default_rng(0).normal(size=time.size)
+    base = deployment("base", time, {"total_field": field})
+    (found,) = with_daily_variation([deployment("log", time, {})], base)
     assert variation_level_sigma(found) < 3.0
 
 

@@ -41,21 +41,13 @@ def test_agrees_with_the_published_calculator() -> None:
     test/data/2020-01-01; printed to 0.1 nT. Its coefficients differ in the last digit from those that IAGA
     published: 0.5 nT, where ppigrf's own test grants 1.
     """
-    golden = np.array(
-        [  # longitude, north, east, down
-            [-179, 4038.2, -50.2, 57586.4],
-            [-140, 2746.9, 745.7, 57193.6],
-            [-100, 1476.2, -949.3, 56763.1],
-            [0, 6560.4, -151.6, 54497.7],
-            [60, 3684.1, 3156.0, 56835.4],
-            [100, 1707.5, 1167.5, 58517.5],
-        ]
-    )
+    golden = np.array([  # longitude, north, east, down
+        [-179, 4038.2, -50.2, 57586.4], [-140, 2746.9, 745.7, 57193.6], [-100, 1476.2, -949.3, 56763.1],
+        [0, 6560.4, -151.6, 54497.7], [60, 3684.1, 3156.0, 56835.4], [100, 1707.5, 1167.5, 58517.5],
+    ])  # fmt: skip
     thirteenth = module._model(module.newest().with_name("IGRF13.shc"))
-    n = len(golden)
-    field = module._block(
-        thirteenth, golden[:, 0], np.full(n, 80.0), np.full(n, -5000.0), np.full(n, at(2020, 1, 1))
-    )
+    latitude, depth, time = (np.full(len(golden), one) for one in (80.0, -5000.0, at(2020, 1, 1)))
+    field = module._block(thirteenth, golden[:, 0], latitude, depth, time)
     np.testing.assert_allclose(field, golden[:, 1:], atol=0.5)
 
 
@@ -125,12 +117,7 @@ TIME = 1_400_000_000.0 + np.arange(3.0)
 
 
 def deployment(**attrs: str) -> xr.Dataset:
-    columns = {
-        "heading": [350.0, 10.0, 200.0],
-        "latitude": [49.5] * 3,
-        "longitude": [-57.9] * 3,
-        "depth": [0.0] * 3,
-    }
+    columns = {"heading": [350.0, 10.0, 200.0], "latitude": [49.5] * 3, "longitude": [-57.9] * 3}
     return xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": TIME}, attrs)
 
 
@@ -139,9 +126,8 @@ def test_the_declination_is_that_of_another_implementation() -> None:
     east, north, _ = ppigrf.igrf(-57.9, 49.5, 0.0, datetime.fromtimestamp(TIME[0], UTC).replace(tzinfo=None))
     declination = float(np.degrees(np.arctan2(east, north)).item())
     true = with_true_heading(deployment(heading_reference="magnetic"))
-    np.testing.assert_allclose(
-        true["heading"], (np.array([350.0, 10.0, 200.0]) + declination) % 360, atol=1e-3
-    )
+    expected = (np.array([350.0, 10.0, 200.0]) + declination) % 360
+    np.testing.assert_allclose(true["heading"], expected, atol=1e-3)
     assert true.attrs["heading_reference"] == "true"
     assert declination < -15  # west of north off Newfoundland
 
@@ -185,6 +171,5 @@ def test_its_slopes_are_its_own() -> None:
 def test_refuses_what_the_series_refuses() -> None:
     with pytest.raises(OutOfRange, match="the IGRF covers"):
         NearbyField().field_and_slopes(0.0, 0.0, 0.0, 4e9)
-    assert (
-        NearbyField().field_and_slopes(0.0, 0.0, 0.0, 1.89e9)[0] > 20_000
-    )  # less than LONG before the model's end
+    # near the model's end
+    assert NearbyField().field_and_slopes(0.0, 0.0, 0.0, 1.89e9)[0] > 20_000

@@ -7,14 +7,7 @@ import pytest
 from commands import Command
 
 from magbridge.errors import OutOfRange, WrongUse
-from magbridge.field.continuation import (
-    continued,
-    draw_steps,
-    merge,
-    prepare,
-    smoothed,
-    surveyed_at,
-)
+from magbridge.field.continuation import continued, draw_steps, merge, prepare, smoothed, surveyed_at
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write
@@ -183,10 +176,8 @@ def test_the_difference_of_surveys_is_reported() -> None:
 
     a, b, c = (AnomalyGrid(LON, LAT, monopole(60.0) + offset) for offset in (0.0, 3.0, 9.0))
     assert merged(a, b) == "merged, 3.0 nT RMS difference in their overlap"
-    assert (
-        merged(a, b, c)
-        == f"merged, {np.sqrt((3**2 + 9**2 + 6**2) / 3):.1f} nT RMS difference in their overlap"
-    )
+    rms = np.sqrt((3**2 + 9**2 + 6**2) / 3)
+    assert merged(a, b, c) == f"merged, {rms:.1f} nT RMS difference in their overlap"
     west, east = (AnomalyGrid(LON[part], LAT, a.anomaly[:, part]) for part in (slice(30), slice(40, None)))
     assert merged(west, east) == "merged, no two of them overlap"
 
@@ -249,19 +240,13 @@ def test_the_whole_preparation_and_its_pictures(tmp_path: Path) -> None:
     outline = [(-58.08, 49.46), (-57.92, 49.46), (-57.92, 49.54), (-58.08, 49.54)]
     grid, steps = prepare([low, high], smooth=1.0, mask=outline)
     assert grid.altitude == 90.0
-    assert [step.title.partition(",")[0] for step in steps] == [
-        "as surveyed: low.grd",
-        "as surveyed: high.grd",
-        "continued +30 m: low.grd",
-        "merged",
-        "masked",
-        "smoothed over 1 km: 1.5 nT RMS removed",
-    ]
+    first = "as surveyed: low.grd", "as surveyed: high.grd", "continued +30 m: low.grd"
+    last = "merged", "masked", "smoothed over 1 km: 1.5 nT RMS removed"
+    assert [step.title.partition(",")[0] for step in steps] == [*first, *last]
     assert np.isnan(grid.look_up(-58.09, 49.5).anomaly)
     inside = grid.look_up(-58.02, 49.51).anomaly
-    assert inside == pytest.approx(
-        AnomalyGrid(LON, LAT, monopole(90.0)).look_up(-58.02, 49.51).anomaly, rel=0.2
-    )
+    true = AnomalyGrid(LON, LAT, monopole(90.0)).look_up(-58.02, 49.51).anomaly
+    assert inside == pytest.approx(true, rel=0.2)
     draw_steps(steps, tmp_path / "steps.png")
     assert (tmp_path / "steps.png").stat().st_size > 20_000
 

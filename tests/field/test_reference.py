@@ -134,10 +134,9 @@ UNDATED = [log(0.0), log(1.7e9, time_reference="boot"), log(3e8)]
 
 @pytest.mark.parametrize("undated", UNDATED)
 def test_there_is_no_field_of_1970(undated: xr.Dataset) -> None:
+    told = r"flight\.BIN: its times count from the boot.* --date YYYY-MM-DD"
     for compute in (reference_field, earth_field):
-        with pytest.raises(
-            FormatError, match=r"flight\.BIN: its times count from the boot.* --date YYYY-MM-DD"
-        ):
+        with pytest.raises(FormatError, match=told):
             compute(undated)
     with pytest.raises(FormatError, match="--date"):
         with_true_heading(undated, "magnetic")
