@@ -19,6 +19,7 @@ from magbridge.field.reference import (
     reference_field,
     with_true_heading,
 )
+from magbridge.logs.deployment import deployment as made
 from sitl import Twin, load
 
 TIME = 1386201600.0 + np.arange(6.0)
@@ -77,9 +78,9 @@ def test_a_given_reference_counts_where_it_is_given() -> None:
 
 
 def test_rows_without_a_position_get_one_from_their_neighbours() -> None:
+    nan = np.nan
     gaps = deployment(
-        latitude=[np.nan, 49.0, np.nan, np.nan, 49.3, np.nan],
-        longitude=[np.nan, 179.9, np.nan, np.nan, -179.8, np.nan],
+        latitude=[nan, 49.0, nan, nan, 49.3, nan], longitude=[nan, 179.9, nan, nan, -179.8, nan]
     )
     longitude, latitude, depth = positions(gaps)
     np.testing.assert_allclose(latitude, [49.0, 49.0, 49.1, 49.2, 49.3, 49.3])
@@ -121,12 +122,8 @@ N = 5
 
 
 def log(start: float, **attrs: str) -> xr.Dataset:
-    columns = {"latitude": 47.0, "longitude": -52.0, "heading": 10.0}
-    return xr.Dataset(
-        {name: ("time", np.full(N, value)) for name, value in columns.items()},
-        coords={"time": start + np.arange(float(N))},
-        attrs={"source": "flight.BIN", **attrs},
-    )
+    columns = {"latitude": np.full(N, 47.0), "longitude": np.full(N, -52.0), "heading": np.full(N, 10.0)}
+    return made("flight.BIN", start + np.arange(float(N)), columns, attrs=attrs)
 
 
 UNDATED = [log(0.0), log(1.7e9, time_reference="boot"), log(3e8)]

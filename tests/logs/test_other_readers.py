@@ -56,12 +56,8 @@ def test_a_trajectory_is_as_xarray_reads_it(tmp_path: Path) -> None:
             variable[[3, 7]] = -99
     theirs = xr.open_dataset(path)
     back = logs.read(path)
-    np.testing.assert_allclose(
-        back["time"],
-        theirs["time"].to_numpy().astype("datetime64[us]").astype(float) * 1e-6,
-        rtol=0,
-        atol=1e-5,
-    )
+    seconds = theirs["time"].to_numpy().astype("datetime64[us]").astype(float) * 1e-6
+    np.testing.assert_allclose(back["time"], seconds, rtol=0, atol=1e-5)
     assert set(back.data_vars) == set(theirs.data_vars) - {"time"}
     for column in back.data_vars:
         np.testing.assert_allclose(back[column], theirs[column], rtol=1e-6, err_msg=str(column))

@@ -128,14 +128,9 @@ def test_a_bridges_own_log(tmp_path: Path) -> None:
         raw: dict[str, Any] = {"x": 1.5, "y": 2.5, "z": k, "delay_y": 10, "delay_z": 20, "supply": np.nan}
         log.ours(k, "MAG_RAW", time_usec=time_us - 7, power_cycle=2, flags=8, temperature=4, **raw)
         if k != 1:
-            field: dict[str, Any] = {
-                "total_field": 50_000.125 + k,
-                "total_field_sigma": 2,
-                "x": 1,
-                "anomaly": np.nan,
-            }
-            flags = int(Quality.GAP)
-            log.ours(k, "MAG_FIELD", time_usec=time_us - 7, flags=flags, **field)
+            field: dict[str, Any] = {"total_field": 50_000.125 + k, "total_field_sigma": 2, "x": 1}
+            field |= {"anomaly": np.nan, "flags": int(Quality.GAP)}
+            log.ours(k, "MAG_FIELD", time_usec=time_us - 7, **field)
         log.ours(k, "NAMED_VALUE_FLOAT", name="mag", value=50_000)
         log.ours(k, "HIGHRES_IMU", xmag=0.5)
     back = log.read(tmp_path)

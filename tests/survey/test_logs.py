@@ -20,6 +20,7 @@ from magbridge.field.geodesy import offset
 from magbridge.field.igrf import igrf
 from magbridge.field.read import read_grid
 from magbridge.logs import read_each, write
+from magbridge.logs.deployment import deployment
 from magbridge.records import Quality
 
 ORIGIN, START, STEP = (49.5, -57.9), 1.4e9, 20.0
@@ -68,11 +69,7 @@ def flown(
     read = body + IRON[vehicle][0] + rng.normal(0, NOISE, (n, 3))
     names = "mag_x", "mag_y", "mag_z", "heading", "pitch", "roll", "latitude", "longitude"
     columns = dict(zip(names, (*read.T, *attitude.T, latitude, longitude), strict=True))
-    units = {"mag": "nT"}
-    return xr.Dataset(
-        {name: ("time", one, {"units": units.get(name[:3], "deg")}) for name, one in columns.items()},
-        {"time": ("time", began + STEP * np.arange(n), {"units": "s"})}, {"source": vehicle},
-    )  # fmt: skip
+    return deployment(vehicle, began + STEP * np.arange(n), columns)
 
 
 def calibrated(vehicle: str, path: Path, **slow: float) -> Path:
@@ -130,8 +127,7 @@ def test_a_base_station_takes_a_daily_variation_off(command: Command, tmp_path: 
     time = STEP * np.arange(-10.0, len(place) + 10.0)
     varied = 25.0 * np.sin(2.0 * np.pi * time / 2400.0)
     write(flown("comet", place, varied=varied[10:-10]), tmp_path / "log.nc")
-    base = xr.Dataset({"total_field": ("time", 53_000.0 + varied, {"units": "nT"})}, {"time": START + time})
-    write(base, tmp_path / "base.nc")
+    write(deployment("base", START + time, {"total_field": 53_000.0 + varied}), tmp_path / "base.nc")
     words = tmp_path / "log.nc", "--calibration", calibrated("comet", tmp_path / "cal.json")
     error, sigma, _ = judged(command, tmp_path, *words, "--base", tmp_path / "base.nc")
     assert np.std(error) < 1.5

@@ -20,12 +20,14 @@ from magbridge.field.geodesy import offset
 from magbridge.field.igrf import igrf, magnitude
 from magbridge.field.read import read_grid
 from magbridge.field.reference import main_field
+from magbridge.logs.deployment import deployment
 from magbridge.survey.run import Result
 
 ORIGIN = 49.5, -57.9
 SPEED_M_S, RATE_HZ, SIDE_M = 15.0, 2.0, 1_000.0
 LAG_S, LEVER_M, NOISE_NT = 0.3, np.array([1.5, -0.8]), 0.05
 SENSOR = "mag_tail"
+TRUE_NORTH = {"heading_reference": "true"}
 
 
 class Grid(NamedTuple):
@@ -38,13 +40,7 @@ class Grid(NamedTuple):
 
 
 def grid(
-    seed: int = 1,
-    depth: float = 150.0,
-    side: float = SIDE_M,
-    *,
-    level: float = 3.0,
-    error: float = 2.0,
-    rise: float = 0.0,
+    seed: int = 1, side: float = SIDE_M, *, level: float = 3.0, error: float = 2.0, rise: float = 0.0
 ) -> Grid:
     """Return lines 100 m and ties 500 m from each other, flown to and fro, with a level for each line.
 
@@ -52,8 +48,8 @@ def grid(
     height is within `rise` m of 80 m.
     """
     random = np.random.default_rng(seed)
-    # sources at random depths below the sensor
-    rock = Rock.of_waves(50.0, random.gamma(2.0, 0.5 / depth, 400), *random.uniform(0.0, 2 * np.pi, (2, 400)))
+    # sources at random depths, 150 m below the sensor
+    rock = Rock.of_waves(50.0, random.gamma(2.0, 0.5 / 150.0, 400), *random.uniform(0.0, 2 * np.pi, (2, 400)))
     along = np.arange(0.0, side, SPEED_M_S / RATE_HZ)
     place, heading, line, time = [], [], [], []
     starts = [(across, 0.0) for across in np.arange(0.0, side + 1, 100.0)]
@@ -82,20 +78,9 @@ def grid(
     reading = magnitude(igrf(longitude, latitude, deeper - 80.0, clocks)) + truth
     reading += error * np.cos(psi - 0.7) + random.normal(0, level, len(starts))[label]
     reading += random.normal(0, NOISE_NT, len(clocks))
-    columns = {
-        "latitude": (latitude, "deg"),
-        "longitude": (longitude, "deg"),
-        "depth": (deeper - 80.0, "m"),
-        "heading": (np.degrees(psi) % 360.0, "deg"),
-        "line": (label.astype(float), "1"),
-        SENSOR: (reading, "nT"),
-    }
-    log = xr.Dataset(
-        {name: ("time", values, {"units": units}) for name, (values, units) in columns.items()},
-        coords={"time": clocks},
-        attrs={"source": "grid", "heading_reference": "true"},
-    )
-    return Grid(log, truth, label)
+    columns = {"latitude": latitude, "longitude": longitude, "depth": deeper - 80.0, SENSOR: reading}
+    columns |= {"heading": np.degrees(psi) % 360.0, "line": label.astype(float)}
+    return Grid(deployment("grid", clocks, columns, {SENSOR: "nT"}, TRUE_NORTH), truth, label)
 
 
 def left_over(found: Result, truth: FloatArray) -> float:
@@ -170,11 +155,8 @@ def test_command_with_a_known_shift(flown: Grid, tmp_path: Path, command: Comman
     crossings, tracks = tmp_path / "crossings.csv", tmp_path / "tracks.geojson"
     facts = json.loads(command(*given, "--crossovers", crossings, "--tracks", tracks, "--json").out)
     numbers = {f"{number:g}" for number in np.unique(lines).tolist()}
-    assert {
-        name
-        for row in csv.DictReader(crossings.read_text().splitlines())
-        for name in (row["line"], row["crossed"])
-    } == numbers
+    rows = list(csv.DictReader(crossings.read_text().splitlines()))
+    assert {row[name] for row in rows for name in ("line", "crossed")} == numbers
     features = json.loads(tracks.read_text())["features"]
     assert {feature["properties"]["line"] for feature in features} == numbers
     assert out.exists()
@@ -211,20 +193,11 @@ def box(start: float, minutes: float = 16.0) -> xr.Dataset:
     heading = 90.0 * ((time - start) // 60.0)
     heading += np.where((leg > 40) & (leg < 55), 5.0 * swing, 0.0)
     zero = np.zeros(len(time))
-    columns = {
-        "latitude": (zero + ORIGIN[0] - 0.003, "deg"),
-        "longitude": (zero + ORIGIN[1], "deg"),
-        "depth": (zero - 500.0, "m"),
-        "heading": (heading % 360.0, "deg"),
-        "roll": (np.where((leg > 5) & (leg < 20), 10.0 * swing, 0.3 * swing), "deg"),
-        "pitch": (np.where((leg > 22) & (leg < 37), 5.0 * swing, 0.0), "deg"),
-        "line": (zero + 900.0, "1"),
-    }
-    log = xr.Dataset(
-        {name: ("time", values, {"units": units}) for name, (values, units) in columns.items()},
-        coords={"time": time},
-        attrs={"source": "box", "heading_reference": "true"},
-    )
+    columns = {"latitude": zero + ORIGIN[0] - 0.003, "longitude": zero + ORIGIN[1], "depth": zero - 500.0}
+    columns |= {"heading": heading % 360.0, "line": zero + 900.0}
+    columns["roll"] = np.where((leg > 5) & (leg < 20), 10.0 * swing, 0.3 * swing)
+    columns["pitch"] = np.where((leg > 22) & (leg < 37), 5.0 * swing, 0.0)
+    log = deployment("box", time, columns, attrs=TRUE_NORTH)
     noise = np.random.default_rng(int(start) % 1000).normal(0.0, NOISE_NT, len(time))
     return log.assign({SENSOR: ("time", magnitude(main_field(log)) + noise, {"units": "nT"})})
 
