@@ -48,11 +48,12 @@ def metres_per_degree(latitude: float | FloatArray) -> tuple[float | FloatArray,
     return ALONG / w_squared**1.5, ACROSS * np.cos(phi) / np.sqrt(w_squared)
 
 
-def offset(latitude: float, longitude: float, north: Number, east: Number) -> tuple[Number, Number]:
+def offset(latitude: Any, longitude: Any, north: Number, east: Number) -> tuple[Number, Number]:
     """Return (latitude, longitude), deg, at `north` and `east` m from a position; longitude in -180..180.
 
-    Both radii of curvature are those at the start, so that :func:`separation` is the exact inverse. The error
-    of an east-west line of 20 km at 60 degrees is 55 m.
+    Arrays (n,) give places from one position, or pair by pair. Both radii of curvature are those at the
+    start, so that :func:`separation` is the exact inverse. The error of an east-west line of 20 km at 60
+    degrees is 55 m.
     """
     per_latitude, per_longitude = metres_per_degree(latitude)
     return latitude + north / per_latitude, wrap(longitude + east / per_longitude)

@@ -12,7 +12,7 @@ nT up to 70 deg of latitude, at a hundredth of the cost. Nearer to a pole the me
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
@@ -215,16 +215,9 @@ def _geocentric(latitude: FloatArray, height: FloatArray) -> tuple[FloatArray, F
     return np.hypot(axis, polar), np.arctan2(polar, axis)
 
 
-def _refuse(
-    quantity: str,
-    values: FloatArray,
-    low: float,
-    high: float,
-    covered: str,
-    shown: Callable[[float], Any] = float,
-) -> None:
+def _refuse(name: str, values: FloatArray, low: float, high: float, covered: str, shown: Any = float) -> None:
     if (bad := values[(values < low) | (values > high)]).size:
-        raise OutOfRange(quantity, shown(bad[0]), covered)
+        raise OutOfRange(name, shown(bad[0]), covered)
 
 
 def _date(time: float) -> str:
@@ -299,12 +292,10 @@ class NearbyField:
         # Least squares on a 3 x 3 x 3 x 3 lattice.
         nodes = np.array(list(product((-1.0, 0.0, 1.0), repeat=4)))
         n, e, d, t = nodes.T
-        places = np.array(
-            [offset(latitude, longitude, a * BOX_HALF_WIDTH_M, b * BOX_HALF_WIDTH_M) for a, b in nodes[:, :2]]
-        )
+        lat, lon = offset(latitude, longitude, n * BOX_HALF_WIDTH_M, e * BOX_HALF_WIDTH_M)
         first, last = coverage()
         times = np.clip(time + t * FITTED_TIME_S, first, last) if first <= time <= last else time
-        field = total_field(places[:, 1], np.clip(places[:, 0], -90.0, 90.0), d * DEEP, times)
+        field = total_field(lon, np.clip(lat, -90.0, 90.0), d * DEEP, times)
         later = (times - time) / FITTED_TIME_S
         design = np.stack([n**0, n, e, d, later, n * n, e * e, d * d, n * e, n * d, e * d], axis=1)
         self._c = np.linalg.lstsq(design, field, rcond=None)[0].tolist()

@@ -40,12 +40,8 @@ READERS: dict[str, Callable[..., Parts]] = {
     ".nc": netcdf,
     ".grd": grd,
     ".asc": ascii_grid,
-    ".csv": table,
-    ".xyz": table,
-    ".txt": table,
-    ".dat": table,
-    ".tif": geotiff,
-    ".tiff": geotiff,
+    **dict.fromkeys((".csv", ".xyz", ".txt", ".dat"), table),
+    **dict.fromkeys((".tif", ".tiff"), geotiff),
 }
 GUARDED = {".nc", ".grd", ".tif", ".tiff"}
 """Formats that third-party libraries read in a child process, because a damaged file may crash them."""

@@ -193,13 +193,8 @@ def _dataset(records: list[Record], smoothed: tuple[FloatArray, FloatArray]) -> 
     # The smoothed state is an offset from dead reckoning: move each position by the difference.
     x, P = smoothed
     moved = x[:, :2] - np.stack([columns["north"], columns["east"]], axis=1)
-    places = [
-        offset(latitude, longitude, *shift)
-        for latitude, longitude, shift in zip(
-            columns["latitude"].tolist(), columns["longitude"].tolist(), moved.tolist(), strict=True
-        )
-    ]
-    columns["smoothed_latitude"], columns["smoothed_longitude"] = np.array(places).T
+    places = offset(columns["latitude"], columns["longitude"], *moved.T)
+    columns["smoothed_latitude"], columns["smoothed_longitude"] = places
     columns["smoothed_sigma_north"], columns["smoothed_sigma_east"] = np.sqrt([P[:, 0, 0], P[:, 1, 1]])
     time = np.array([record.time_us for record in records]) * 1e-6
     return made("track", time, columns, COLUMN_UNITS)
