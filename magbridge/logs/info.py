@@ -115,8 +115,12 @@ def telemetry(log: xr.Dataset) -> list[str]:
         if name not in COLUMNS
         and not name.startswith((AGE, "truth_", "mag"))
         and name not in {"run", "dive", "power_cycle", "line", "line_type"}
-        and float(log[name].max()) > float(log[name].min())
+        and _varies(log, name)
     ]
+
+
+def _varies(log: xr.Dataset, name: str) -> bool:
+    return name in log and float(log[name].max()) > float(log[name].min())
 
 
 def movers(log: xr.Dataset) -> list[str]:
@@ -132,17 +136,10 @@ def movers(log: xr.Dataset) -> list[str]:
 
 def conditions(log: xr.Dataset) -> list[str]:
     """Return the columns of temperature, pressure and depth that vary, and so may change the field."""
-    reckoned = [name for name in CONDITION_COLUMNS if name in log and float(np.ptp(_known(log, name))) > 0.0]
-    return reckoned + [
+    named = [name for name in CONDITION_COLUMNS if _varies(log, name)]
+    return named + [
         name for name in telemetry(log) if usual(log[name].attrs.get("units", "1")) in CONDITION_UNITS
     ]
-
-
-def _known(log: xr.Dataset, name: str) -> FloatArray:
-    """Return the known values (m,) of a column; a single 0 if none is known."""
-    values = log[name].to_numpy().astype(float)
-    known = values[np.isfinite(values)]
-    return known if known.size else np.zeros(1)
 
 
 def _counts(values: FloatArray) -> bool:

@@ -233,7 +233,8 @@ class Bank:
         """Drop hypotheses of negligible weight, split wide ones, and regularly merge those at one place."""
         keep = self.w > MIN_WEIGHT_FRACTION * self.w.max()
         if not keep.all():
-            self._select(keep)
+            w = self.w[keep]
+            self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
         while len(self) > MAX_HYPOTHESES:  # coarsen: dropping a hypothesis could lose the true place
             self.resolution *= COARSENING_FACTOR
             self._merge()
@@ -247,10 +248,6 @@ class Bank:
         wide = (width > 1.5 * self.resolution) & (self.w > 1e-4)
         if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MAX_HYPOTHESES:
             self._split(wide)
-
-    def _select(self, keep: BoolArray) -> None:
-        w = self.w[keep]
-        self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
 
     def _split(self, wide: BoolArray) -> None:
         """Split each `wide` hypothesis in three along its longest position axis; keep mean and covariance."""

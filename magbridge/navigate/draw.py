@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from magbridge.arrays import RealArray
 from magbridge.field.geodesy import metres_per_degree, signed_longitude
@@ -78,9 +78,8 @@ def _sigma(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
     axis.semilogy(hours, sigma, color="C0", label="sigma, filter")
     smoothed = np.hypot(result["smoothed_sigma_north"], result["smoothed_sigma_east"])
     axis.semilogy(hours, smoothed, color="C2", label="sigma, smoothed")
-    for name, line in (("unaided", "--"), ("bound", ":")):
+    for name, line, label in (("unaided", "--", "sigma, dead reckoning alone"), ("bound", ":", "bound")):
         if f"{name}_sigma" in result:
-            label = "sigma, dead reckoning alone" if name == "unaided" else "bound"
             axis.semilogy(hours, result[f"{name}_sigma"], color="C0", ls=line, lw=1, label=label)
     error, reckoned = errors(result)
     if np.isfinite(error).any():
@@ -231,6 +230,5 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
 
 def _plain(axis: Axes) -> None:
     """Label the logarithmic y axis with plain numbers: 100, not 10^2."""
-    plain = FuncFormatter(lambda value, _: f"{value:g}")
-    axis.yaxis.set_major_formatter(plain)
+    axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")

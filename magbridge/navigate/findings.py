@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import BoolArray, RealArray
+from magbridge.arrays import RealArray
 from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
@@ -123,13 +123,15 @@ def findings_of(
     silent = (state == NavigationState.DEAD_RECKONING) & ~off
     if silent.mean() > 0.5:
         known = hypot(options.bias_sigma, options.map_sigma)
+        variance = result["covariance_nn"] + result["covariance_ee"]
+        typical = float(np.sqrt(np.median(variance.to_numpy()[silent])))
         findings.append(
             f"the field carries no information for {100.0 * silent.mean():.0f} % of the track: "
             + (
                 f"the map is flat there ({grid.rms:.1f} nT RMS, where calibration and map are known only to "
                 f"{known:.1f} nT)"
                 if grid.rms < MIN_RELIEF_SIGMA * known
-                else f"dead reckoning is as good as this map can be ({_sigma(result, silent):.0f} m)"
+                else f"dead reckoning is as good as this map can be ({typical:.0f} m)"
             )
         )
     findings += _jumps(jumps, float(result["time"][0]))
@@ -143,10 +145,6 @@ def findings_of(
     if state[-1] == NavigationState.SEARCHING and not off[-1]:
         findings.append("several positions still explain the field at the end of the log")
     return findings
-
-
-def _sigma(result: xr.Dataset, rows: BoolArray) -> float:
-    return float(np.sqrt(np.median((result["covariance_nn"] + result["covariance_ee"]).to_numpy()[rows])))
 
 
 def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from magbridge.arrays import FloatArray
+from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.pictures import save
@@ -72,8 +73,7 @@ def _residuals(ax: Axes, residual: FloatArray) -> None:
     known = residual[np.isfinite(residual)]
     edge = float(np.quantile(np.abs(known), 0.995))
     ax.hist(np.clip(known, -edge, edge), bins=80, color="0.4")
-    rms = float(np.sqrt(np.mean(known**2)))
-    ax.set(title=f"Residuals of the samples: {rms:.2f} nT RMS", xlabel="nT", ylabel="Samples")
+    ax.set(title=f"Residuals of the samples: {rms(known):.2f} nT RMS", xlabel="nT", ylabel="Samples")
 
 
 def _crossings(
@@ -92,6 +92,6 @@ def _crossings(
         edge = float(np.quantile(np.abs(after), 0.98)) or 1.0
         dots = ax.scatter(longitude, latitude, c=after, s=14, cmap="PuOr", vmin=-edge, vmax=edge)
         figure.colorbar(dots, ax=ax, shrink=0.85)
-        rms = [float(np.sqrt(np.mean(one**2))) for one in misties]
-        title = f"{len(after)} crossovers: mis-ties after levelling\n{rms[1]:.1f} nT RMS, before {rms[0]:.1f}"
+        size = f"{rms(after):.1f} nT RMS, before {rms(before):.1f}"
+        title = f"{len(after)} crossovers: mis-ties after levelling\n{size}"
     _geographic(ax, samples.origin[0], title)

@@ -434,9 +434,7 @@ def _log_rows(
     else:
         value, terms = scalar_reading(log, column), _channel_terms(log, names)
     log = moved_to_sensor(log, lever) if lever else log
-    expected = magnitude(main_field(log))
-    if "daily_variation" in log:
-        expected = expected + log["daily_variation"].to_numpy()
+    expected = magnitude(main_field(log)) + _daily(log)
     # Anomalies: minus the main field and the daily variation.
     raw, value = scalar_reading(log, column) - expected, value - expected
     samples, known = located(log, value, column)
