@@ -23,6 +23,7 @@ import pandas as pd
 from magbridge.arrays import FloatArray
 from magbridge.columns import YEAR_1980, usual
 from magbridge.logs.checks import MEDIAN_ROWS, boots
+from magbridge.logs.layout import numbers_of
 
 DAY = 86_400.0
 HOURS = ("%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S")
@@ -188,7 +189,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
         return TimeFormat(unit, unit if unit in SUMS else "", zone=zone)
     of_day, by_hour, unit = unit in {SECONDS_OF_DAY, BY_HOUR}, unit == BY_HOUR, unit if unit in EPOCHS else ""
     present = [_seconds_of_day(text) if by_hour else text.strip() for text in texts if text.strip()]
-    numbers = _numbers(pd.Series(present, dtype="str"))
+    numbers = numbers_of(pd.Series(present, dtype="str"))
     if not unit and _on_a_clock(heading, present):
         return TimeFormat("%H%M%S", OF_A_DAY, boot=True)
     date_digits = re.compile(r"(19|20)\d{12}(\.\d+)?")
@@ -277,7 +278,7 @@ def seconds(clock: TimeFormat, cells: pd.Series) -> FloatArray:
         cells = cells.map(_seconds_of_day, na_action="ignore")
     if clock.kind in EPOCHS:
         start, scale = EPOCHS[clock.kind]
-        times = _numbers(cells) * scale + start
+        times = numbers_of(cells) * scale + start
     elif clock.kind in SUMS:
         start, *scales = SUMS[clock.kind]
         parts = cells.astype("string").str.split(n=1, expand=True).reindex(columns=[0, 1])
@@ -290,13 +291,6 @@ def seconds(clock: TimeFormat, cells: pd.Series) -> FloatArray:
         times = epoch(cells, clock.kind, None if clock.boot else clock.zone)
         return times % DAY if clock.boot else times
     return times - leap_seconds(times) if clock.kind.lower().startswith("gps") else times
-
-
-def _numbers(cells: pd.Series) -> FloatArray:
-    """Return the cells (n,) as numbers, also Fortran's 1.6D+09; NaN for others."""
-    if not pd.api.types.is_numeric_dtype(cells):
-        cells = cells.astype("str").str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
-    return np.asarray(pd.to_numeric(cells, errors="coerce"), np.float64)
 
 
 def patterns(texts: Sequence[str]) -> list[str]:

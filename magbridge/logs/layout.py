@@ -15,8 +15,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 from msgspec import structs
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.mapping import CELL_NUMBER, ColumnMapping, declared_by_maker, is_unit
@@ -118,6 +121,13 @@ def cells(line: str, separator: str) -> list[str]:
     if '"' not in line:
         return [cell.strip() for cell in line.rstrip("\r\n").split(separator)] if line.strip("\r\n") else []
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+
+
+def numbers_of(cells: pd.Series) -> FloatArray:
+    """Return the cells (n,) as numbers, also Fortran's 1.6D+09; NaN for others."""
+    if not pd.api.types.is_numeric_dtype(cells):
+        cells = cells.astype("str").str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
+    return np.asarray(pd.to_numeric(cells, errors="coerce"), np.float64)
 
 
 def rows_among(lines: Sequence[str]) -> list[str]:

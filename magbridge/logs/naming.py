@@ -15,7 +15,7 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usual
 from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
-from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
+from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows, numbers_of
 from magbridge.logs.mapping import CELL_NUMBER, NAMES, PATTERNS, ColumnSource, bare, is_called, is_unit, split
 
 AXES = "xyz"
@@ -227,7 +227,7 @@ def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str]:
         return (place,), unit
     # the time is a time of day, unless its cells are whole moments or count something else
     present = cells_in(rows, place)
-    numbers = pd.to_numeric(pd.Series(present, dtype="str").str.replace(",", "."), errors="coerce")
+    numbers = pd.Series(numbers_of(pd.Series(present, dtype="str").str.replace(",", ".")))
     counted = (
         PATTERNS["seconds since midnight"].search(layout.headings[place])
         and numbers.between(0.0, DAY, "left").all()
@@ -369,8 +369,8 @@ def _with_total(layout: Layout, rows: Rows) -> Layout:
 def _numbers(layout: Layout, rows: Rows, places: Sequence[int]) -> FloatArray:
     """Return the numbers (n, k) in k columns, from the rows in which all k cells are numbers."""
     texts = [[layout.number(row[k]) for k in places] for row in rows if max(places) < len(row)]
-    frame = pd.DataFrame(texts, columns=range(len(places)), dtype="str").apply(pd.to_numeric, errors="coerce")
-    numbers = frame.to_numpy(np.float64)
+    frame = pd.DataFrame(texts, columns=range(len(places)), dtype="str")
+    numbers = np.column_stack([numbers_of(column) for _, column in frame.items()])
     return np.asarray(numbers[np.isfinite(numbers).all(axis=1)])
 
 

@@ -18,7 +18,7 @@ from magbridge.columns import YEAR_1980, absent
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, validity_of, without_invalid
 from magbridge.logs.clocks import BY_HOUR, SUMS, CountState, TimeFormat, clock_of, date_order, seconds
-from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells
+from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells, numbers_of
 from magbridge.logs.naming import HEMISPHERES, calendar_of
 from magbridge.records import Quality
 from magbridge.wording import counted
@@ -337,16 +337,15 @@ def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray
     grouped = rf"^([-+]?\d{{1,3}}(?:{group}\d{{3}})+)(?=\D|$)"
     texts = texts.str.replace(grouped, lambda match: re.sub(r"[.,]", "", match[1]), regex=True)
     texts = texts.str.replace(",", ".") if decimal == "," else texts
-    texts = texts.str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
     if unit:
         texts = texts.str.removesuffix(unit).str.strip()
     if name in HEMISPHERES:
         opposite = texts.str.contains("[SW]", regex=True, case=False).to_numpy(bool)
         # only at the ends: the E of 1.2E-05 is an exponent's
         texts = texts.str.replace("^[NSEW]|[NSEW]$|\u00b0", "", regex=True, flags=re.IGNORECASE)
-        values = np.asarray(pd.to_numeric(texts, errors="coerce"), np.float64)
+        values = numbers_of(texts)
         return np.asarray(np.where(opposite, -np.abs(values), values))
-    return np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
+    return np.array(numbers_of(texts))
 
 
 def _on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:

@@ -144,7 +144,7 @@ AXES = {
     "a Greek letter": f"time,Bx [{GREEK}],By [{GREEK}],Bz [{GREEK}]\n1.6e9,20.5,-10.25,45\n",
     "each its own": "time,mag_x [uT],mag_y [mG],mag_z [nT]\n1.6e9,20.5,-102.5,45000\n",
     "behind a comma": "time;Bx, uT;By, uT;Bz, uT\n1.6e9;20.5;-10.25;45\n",
-    "Fortran": "time,mag_x,mag_y,mag_z\n1.6D+09,2.05D+04,-1.025D+04,4.5D+04\n",
+    "Fortran": "time,mag_x,mag_y,mag_z\n1.6D+09,2.05D+01,-1.025D+01,4.5D+01\n",
     "thousands": 'time,mag_x,mag_y,mag_z\n1.6e9,"20,500","-10,250.0","45,000.00"\n',
     "German thousands": "time;mag_x [nT];mag_y [nT];mag_z [nT]\n1600000000;20.500;-10.250;45.000,00\n",
     "a remark in brackets": "time,Bx(raw),By(raw),Bz(raw)\n1.6e9,20500,-10250,45000\n",
