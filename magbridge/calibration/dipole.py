@@ -66,11 +66,6 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
     `values` (..., n, s): the s functions at the n nodes of ``chebpts1`` in [-1, 1], ascending; n > order.
     `order`: the highest power.
     """
-    # Interpolate by Chebyshev polynomials (well conditioned), then convert to powers.
-    n = values.shape[-2]
-    nodes = chebyshev.chebpts1(n)
-    fit = np.linalg.pinv(chebyshev.chebvander(nodes, order))
-    powers = np.zeros((order + 1, order + 1))
-    for degree in range(order + 1):
-        powers[: degree + 1, degree] = chebyshev.cheb2poly(np.eye(order + 1)[degree])[: degree + 1]
-    return np.asarray((powers @ fit) @ values)
+    # least squares at these nodes is the truncated Chebyshev series
+    nodes = chebyshev.chebpts1(values.shape[-2])
+    return np.asarray(np.linalg.pinv(np.vander(nodes, order + 1, increasing=True)) @ values)

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import permutations
+from itertools import permutations, product
 from typing import Annotated, Any
 
 import msgspec
@@ -120,10 +120,8 @@ def _body_axes(calibration: Calibration) -> FloatArray:
     """Return the matrix (9, 12) that turns A's six entries and T into the nine entries of ``R A`` and T."""
     R = np.eye(3) if calibration.boresight is None else calibration.boresight.matrix()
     B = np.zeros((9, 12))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                B[SLOT[j][k], 3 * i + k] += R[i, j]
+    for i, j, k in product(range(3), repeat=3):
+        B[SLOT[j][k], 3 * i + k] += R[i, j]
     B[6:, 9:] = np.eye(3)
     return B
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
 from inspect import signature
 from numbers import Integral, Real
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -138,7 +137,7 @@ def fit(
 def _check_options(method: str, options: dict[str, Any]) -> None:
     """Check the options of a method; WrongUse: a name is unknown, or a value is out of range."""
     tried = ("auto", "survey") if method == "auto" else (method,)
-    names = {name for one in tried for name in signature(_function(one)).parameters} - {"data"}
+    names = {name for one in tried for name in signature(resolve_name(METHODS[one])).parameters} - {"data"}
     for name, value in options.items():
         if name not in names | {"order", "site_bias"}:
             raise WrongUse(f"option of fit: {one_of(name, sorted(names))}")
@@ -168,7 +167,7 @@ def _first_solution(
     failures: list[CalibrationError] = []
     for name, part, own, notes in attempts:
         try:
-            found = _function(name)(part, order, **own)
+            found = resolve_name(METHODS[name])(part, order, **own)
             if in_place:
                 _refuse_large_crust(found)
         except NoSolutionError as error:
@@ -190,19 +189,13 @@ def _refuse_large_crust(found: Fit) -> None:
         )
 
 
-def _function(method: str) -> Callable[..., Fit]:
-    module, _, name = METHODS[method].partition(":")
-    function: Callable[..., Fit] = getattr(import_module(module), name)
-    return function
-
-
 def _rock_may_show(data: Observations, order: int) -> bool:
     """Return True if a fit without crustal field leaves a residual of a crust's size, or has no solution."""
     few = data.thinned(CRUST_TEST_SAMPLES)
     for method in ("nominal", "auto"):
         try:
             with threadpool_limits(1, "blas"):
-                if robust_scale(_function(method)(few, order).residual) <= MAX_CRUST_NT:
+                if robust_scale(resolve_name(METHODS[method])(few, order).residual) <= MAX_CRUST_NT:
                     return True
         except CalibrationError:
             return True

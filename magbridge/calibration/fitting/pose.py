@@ -40,6 +40,7 @@ from magbridge.calibration.fitting.observations import Observations, polynomial_
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents, full_order
 from magbridge.errors import CalibrationError
+from magbridge.estimation.blocks import ParameterBlock, with_blocks
 from magbridge.estimation.priors import FACTOR_MASS, PriorFamily, gain_rotation, polynomial_prior
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.toml import check_entries, convert, load_toml
@@ -137,35 +138,23 @@ def mounted_prior(
     """
     names = [parameter.name for parameter in parameters]
     masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]
-    # Unknowns: those of the free polynomials, then for each mass 3 of the moment, 3 of the induced moment,
-    # 3 of the shift and 3 of the travel. log sigma = constant + design @ eta for each.
-    labels = tuple(f"{name} {kind}" for name in vehicle for kind in ("moment", "induced"))
-    q, h, extra = free.design.shape[0], free.design.shape[1], len(labels)
-    design = np.zeros((q + LATENT * len(masses), h + extra))
-    design[:q, :h] = free.design
-    constant = np.append(free.constant, np.zeros(LATENT * len(masses)))
-    for i, mass in enumerate(masses):
-        first = q + LATENT * i
-        design[first : first + 3, h + 2 * i] = 1.0
-        design[first + 3 : first + 6, h + 2 * i + 1] = 1.0
-        constant[first + 3] = np.log(np.sqrt(3.0))
-        constant[first + 4 : first + 6] = np.log(INDUCED_APART)
-        constant[first + 6 : first + 9] = np.log(mass.sigma)
-        constant[first + 9 : first + 12] = np.log(TRAVEL_SIGMA * np.linalg.norm(mass.travel))
-    centre = np.append(free.centre, np.log([MOMENT, INDUCED] * len(masses)))
+    # after the unknowns of the free polynomials: 3 of each mass's moment, induced moment, shift and travel
+    blocks: list[ParameterBlock] = []
+    alike, none = np.ones(3), np.empty((0, 3))
+    for name, mass in zip(vehicle, masses, strict=True):
+        apart = np.array([np.sqrt(3.0), INDUCED_APART, INDUCED_APART])
+        travel = float(TRAVEL_SIGMA * np.linalg.norm(mass.travel))
+        blocks += [
+            ParameterBlock(f"{name} moment", none, alike, MOMENT, FACTOR_MASS),
+            ParameterBlock(f"{name} induced", none, apart, INDUCED, FACTOR_MASS),
+            ParameterBlock(f"{name} shift", none, alike, mass.sigma),
+            ParameterBlock(f"{name} travel", none, alike, travel),
+        ]
+    whole = with_blocks(free, tuple(blocks))
     # the remainder is small: give the mass's own polynomials a narrow prior
     for name in vehicle:
         k = 3 + 3 * names.index(name)
-        centre[k], centre[k + 1] = np.log(REST_T), np.log(REST_A)
-    whole = PriorFamily(
-        E=free.E,
-        offset=free.offset,
-        constant=constant,
-        design=design,
-        centre=centre,
-        spread=np.append(free.spread, np.full(extra, FACTOR_MASS)),
-        names=free.names + labels,
-    )
+        whole.centre[k : k + 2] = np.log([REST_T, REST_A])
     return _linearised(whole, masses, np.zeros((len(masses), LATENT)))
 
 
@@ -193,11 +182,9 @@ def _mass(
 
 def _linearised(family: PriorFamily, masses: list[_Mass], latent: FloatArray) -> PriorFamily:
     """Return the prior with the dipoles linearised about `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
-    size, q = family.E.shape
-    # c = E z + offset, with the dipoles' columns appended to E and their remainder in the offset
-    J = np.zeros((size, q + LATENT * len(masses)))
-    J[:, :q] = family.E
-    offset = np.zeros(size)
+    # c = E z + offset, with the dipoles' columns at the end of E and their remainder in the offset
+    J, offset = family.E.copy(), np.zeros(len(family.E))
+    q = J.shape[1] - LATENT * len(masses)
     for i, (mass, at) in enumerate(zip(masses, latent, strict=True)):
         by, value = mass.columns(at)
         place = (9 * mass.rows[:, None] + np.arange(9)).ravel()

@@ -573,12 +573,9 @@ def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
             factor[columns] = channel.scale / wider[k].scale
     if (factor == 1.0).all():
         return sensor
-    prior = np.array(sensor.prior_sigma)
-    precision = np.linalg.inv(np.array(sensor.covariance))
-    moment = precision @ np.array(sensor.coefficients)
-    data = GaussianInformation(
-        (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor, moment * factor
-    )
+    mean, covariance, prior = map(np.array, (sensor.coefficients, sensor.covariance, sensor.prior_sigma))
+    known = GaussianInformation.from_posterior(mean, covariance, 0.0 * mean, np.diag(prior**2))
+    data = GaussianInformation(known.precision * np.outer(factor, factor), known.vector * factor)
     chosen = _choose_widths(data, *_sensor_prior(sensor))
     adapted = msgspec.structs.replace(
         sensor,
