@@ -141,11 +141,6 @@ class LogSeries(NamedTuple):
         """Time of the samples, (n,), µs since 1970 UTC, rounded to integers as for single samples."""
         return np.rint(self.time * 1e6)
 
-    def part(self, rows: slice, names: Sequence[str]) -> LogSeries:
-        """Return the samples of `rows`, with the telemetry channels `names` only."""
-        values = {name: self.values[name][rows] for name in names}
-        return LogSeries(self.time[rows], self.reading[rows], values, self.kernel)
-
 
 class Effect(Term, frozen=True, kw_only=True):
     """Term that depends on a quantity other than the positions: a temperature, a current, time.

@@ -251,13 +251,6 @@ def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> C
     return best
 
 
-def first_guess(place: FloatArray) -> Choice:
-    """Return a field of middle length and usual amplitude, with white noise, at places (n, 2), m."""
-    rungs = ladder(place)
-    length = float(rungs[len(rungs) // 2 + 1])
-    return Choice(GaussianField(nodes_for(place, length, SMOOTH), length, SMOOTH), SIZE, 0.0)
-
-
 def climb(
     sums: SampleSums,
     start: Choice,

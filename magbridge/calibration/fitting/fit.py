@@ -98,7 +98,8 @@ def fit(
     given = {} if site_bias is None else {"site_bias": site_bias}
     _check_options(method, {"order": order, **options, **given})
     # without a true field, try the survey fit where the track separates the crustal field from the vehicle
-    bias = _default_bias(data) if site_bias is None else site_bias
+    of_reference = MAIN_FIELD_SIGMA_NT if data.map_sigma is None else data.map_sigma
+    bias = of_reference * data.lacks_rock if site_bias is None else site_bias
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
     if in_place:
         method = "survey"
@@ -200,13 +201,6 @@ def _rock_may_show(data: Observations, order: int) -> bool:
         except CalibrationError:
             return True
     return False
-
-
-def _default_bias(data: Observations) -> float:
-    """Return the default 1-sigma of the reference's constant bias, nT."""
-    if not data.lacks_rock:
-        return 0.0
-    return MAIN_FIELD_SIGMA_NT if data.map_sigma is None else data.map_sigma
 
 
 def _biased(found: Fit, sigma: float) -> Fit:

@@ -74,6 +74,10 @@ def observations(
         attitude = np.radians(np.stack(angles, axis=1))
     time = np.asarray(ds["time"].values, float)
     place, unmapped, origin = _places(ds)
+    map_sigma = None
+    if grid is not None:  # of the map's cells, its constant bias and the daily variation
+        of_map = hypot(float(np.sqrt(np.nanmean(grid.sigma**2))), grid.level_sigma) or MAP_ERROR
+        map_sigma = hypot(of_map, variation_level_sigma(ds))
     return Observations(
         field=np.stack([columns[name] for name in CHANNELS], axis=1),
         reference=total,
@@ -89,7 +93,7 @@ def observations(
         unmapped=unmapped,
         temperature=_column(ds, TEMPERATURE) if TEMPERATURE in ds else None,
         depth=_column(ds, "depth") if "depth" in ds else None,
-        map_sigma=None if grid is None else hypot(grid_sigma(grid), variation_level_sigma(ds)),
+        map_sigma=map_sigma,
         origin=origin,
         sensor=str(ds.attrs.get("sensor", "")),
         model=model,
@@ -131,11 +135,6 @@ def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple
     north, east = separation(*origin, latitude, longitude)
     unmapped = np.broadcast_to(np.where(known, 0.0, 1.0), len(north))
     return np.stack([north, east, depth], axis=1), unmapped, origin
-
-
-def grid_sigma(grid: AnomalyGrid) -> float:
-    """Return the 1-sigma of a map, nT: of its cells (RMS) and its constant bias, or else a default."""
-    return hypot(float(np.sqrt(np.nanmean(grid.sigma**2))), grid.level_sigma) or MAP_ERROR
 
 
 def _column(ds: xr.Dataset, name: str) -> FloatArray:

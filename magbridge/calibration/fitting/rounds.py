@@ -12,13 +12,14 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.field_search import (
+    SIZE,
+    SMOOTH,
     Choice,
     Weighed,
     about_the_middle,
     choose,
     climb,
     fine_enough,
-    first_guess,
     ladder,
     nodes_for,
 )
@@ -130,8 +131,12 @@ class Rounds:
         # a part about the middle shows size and length of the field as well as all samples do
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
-        self.middle = float(np.median(ladder(survey.place[self.part])))
-        self.choice = self._everywhere(first_guess(survey.place[self.part]))
+        place = survey.place[self.part]
+        lengths = ladder(place)
+        self.middle, length = float(np.median(lengths)), float(lengths[len(lengths) // 2 + 1])
+        # a field of middle length and usual amplitude, with white noise
+        field = GaussianField(nodes_for(place, length, SMOOTH), length, SMOOTH)
+        self.choice = self._everywhere(Choice(field, SIZE, 0.0))
         # begin near the solution, with the crustal field as noise: the start with the smaller residuals
         samples, prior = survey.samples, self.family.prior(self.family.centre)
         begun = [approach(samples, prior, self.family.nearest_latent(one)) for one in starts(samples)]
