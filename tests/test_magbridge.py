@@ -59,6 +59,7 @@ READ_LOG = (
     "from magbridge.cli.common import without_dask; without_dask(); "
     "from magbridge.logs.deployment import deployment; deployment('a.csv', [0.0, 1.0], {'mag_x': [1.0, 2.0]})"
 )
+MAIN = "from magbridge.cli import main; main"
 RUN_COMMAND = (
     "import magbridge.bridge.run as bridge; bridge.run = lambda path: None; "
     "from magbridge.__main__ import main; main(['run', '--config', 'bridge.toml'])"
@@ -70,11 +71,8 @@ IMPORTS = {
     "the live path": ("import magbridge.bridge.run", ASHORE - {"pymavlink"}),
     "run": (RUN_COMMAND, {"cyclopts", "magbridge.cli"}),
     "the main field": ("from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)", ASHORE),
-    "help": ("from magbridge.cli import main; main(['--help'])", {"numpy", *ASHORE}),
-    "a log that is not there": (
-        "from magbridge.cli import main; main(['calibrate', 'none', '-o', 'x'])",
-        {"numpy", *ASHORE},
-    ),
+    "help": (f"{MAIN}(['--help'])", {"numpy", *ASHORE}),
+    "a log that is not there": (f"{MAIN}(['calibrate', 'none', '-o', 'x'])", {"numpy", *ASHORE}),
     "maps": ("from magbridge.field import grid, read, reference", ASHORE),
     "a log": (READ_LOG, {"dask"}),
 }

@@ -67,18 +67,10 @@ def test_seconds_too_few_to_be_since_1970_count_from_a_start() -> None:
 @pytest.mark.parametrize(
     ("columns", "about", "hint"),
     [
-        (
-            {"mag_x": 30.0, "mag_y": 5.0, "mag_z": 45.0},
-            "length",
-            "54.31 nT (median); in uT it would be the Earth's",
-        ),
+        (dict(zip(CHANNELS, (30.0, 5.0, 45.0), strict=True)), "length", "54.31 nT (median); in uT it would"),
         (dict.fromkeys(CHANNELS, 68_000.0), "length", "the vector's length is 1.178e+05 nT (median)"),
         (dict.fromkeys(CHANNELS, np.nan), "length", ""),
-        (
-            {"depth": -12.0},
-            "depth",
-            "depth is -12 m (median): if it counts upwards, scale = -1 in columns.toml",
-        ),
+        ({"depth": -12.0}, "depth", "depth is -12 m (median): if it counts upwards, scale = -1 in"),
     ],
     ids=["another unit", "no unit", "never known", "upwards"],
 )

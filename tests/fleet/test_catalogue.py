@@ -17,25 +17,14 @@ from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import catalogue as room
+from magbridge.fleet import register
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.learn import shape_groups, shapes_of
 from magbridge.fleet.memory import fleet_of, lessons
 from magbridge.fleet.page import write_pages
 from magbridge.fleet.process import work
-from magbridge.fleet.register import (
-    Deployment,
-    Vehicle,
-    add_logs,
-    add_vehicle,
-    current_files,
-    jobs,
-    masses,
-    read_fleet,
-    status,
-    vehicles,
-)
 
-MAY = Deployment("may", ())
+MAY = register.Deployment("may", ())
 
 
 @pytest.fixture
@@ -102,42 +91,42 @@ def test_a_folder_that_cannot_be_written_is_one_line(empty: Catalogue) -> None:
 
 
 def test_two_vehicles_of_one_name(empty: Catalogue) -> None:
-    assert add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1")) == 1
-    assert add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1")) == 0
+    assert register.add_vehicle(empty, "comet", register.Vehicle(parameters=("battpos",), serial="1")) == 1
+    assert register.add_vehicle(empty, "comet", register.Vehicle(parameters=("battpos",), serial="1")) == 0
     with pytest.raises(WrongUse, match=r"another vehicle of that name: serial 1, .* not serial 2"):
-        add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="2"))
+        register.add_vehicle(empty, "comet", register.Vehicle(parameters=("battpos",), serial="2"))
     where = {"battpos": Mounting((-0.5, 0.0, 0.0), (0.0254, 0.0, 0.0))}
     for mass in (where, {}, where, where):  # measured, taken back, and given again
-        add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1", mass=mass))
-        assert masses(vehicles(empty)["comet"]) == mass
+        register.add_vehicle(empty, "comet", register.Vehicle(parameters=("battpos",), serial="1", mass=mass))
+        assert register.masses(register.vehicles(empty)["comet"]) == mass
     assert len(empty.rows("vehicles")) == 4
     for given in ((), ("battpos", "ballast")):
         with pytest.raises(WrongUse, match=f"not so for {given[-1] if given else 'battpos'}$"):
-            add_vehicle(empty, "u", Vehicle(parameters=given, mass=where))
-    assert "u" not in vehicles(empty)
+            register.add_vehicle(empty, "u", register.Vehicle(parameters=given, mass=where))
+    assert "u" not in register.vehicles(empty)
     # two people at once, who could not see each other
     first = empty.rows("vehicles")[0]
     empty.add("vehicles", [{**first, "serial": "2"}])
     with pytest.raises(FormatError, match="expected one vehicle 'comet', got two"):
-        vehicles(empty)
+        register.vehicles(empty)
 
 
 def test_a_log_that_changed_is_another_version(catalogue: Catalogue, tmp_path: Path) -> None:
     log = fly(tmp_path / "log.nc", 1, 0)
-    assert add_logs(catalogue, "comet", MAY, [log]) == (1, [])
-    assert add_logs(catalogue, "comet", MAY, [log]) == (0, [])
-    first, kept = jobs(catalogue)[0].name, log.read_bytes()
+    assert register.add_logs(catalogue, "comet", MAY, [log]) == (1, [])
+    assert register.add_logs(catalogue, "comet", MAY, [log]) == (0, [])
+    first, kept = register.jobs(catalogue)[0].name, log.read_bytes()
     fly(log, 1, 1)
-    count, (output,) = add_logs(catalogue, "comet", MAY, [log])
+    count, (output,) = register.add_logs(catalogue, "comet", MAY, [log])
     assert count == 1
     assert output.endswith("log.nc: has changed since it was catalogued; its present contents count")
-    (now,) = current_files(catalogue.rows("files"))
+    (now,) = register.current_files(catalogue.rows("files"))
     assert now["version"] == 2
-    assert jobs(catalogue)[0].name != first
+    assert register.jobs(catalogue)[0].name != first
     log.write_bytes(kept)  # and back
-    add_logs(catalogue, "comet", MAY, [log])
-    assert jobs(catalogue)[0].name == first
-    count, (output,) = add_logs(catalogue, "comet", Deployment("june", ()), [log])
+    register.add_logs(catalogue, "comet", MAY, [log])
+    assert register.jobs(catalogue)[0].name == first
+    count, (output,) = register.add_logs(catalogue, "comet", register.Deployment("june", ()), [log])
     assert count == 1
     assert output.endswith("log.nc: belonged to comet, may; now to comet, june")
 
@@ -149,17 +138,17 @@ def test_a_name_that_can_be_no_folders_is_refused(empty: Catalogue, tmp_path: Pa
         write_pages({name: cast(Any, None)}, tmp_path / "pages", {})
     assert not (tmp_path / "pages").exists()
     with pytest.raises(WrongUse, match="a vehicle's name without slashes"):
-        add_vehicle(empty, name, Vehicle())
-    add_vehicle(empty, "comet", Vehicle())
+        register.add_vehicle(empty, name, register.Vehicle())
+    register.add_vehicle(empty, "comet", register.Vehicle())
     with pytest.raises(WrongUse, match="a deployment's name without slashes"):
-        add_logs(empty, "comet", Deployment(name, ()), [])
+        register.add_logs(empty, "comet", register.Deployment(name, ()), [])
 
 
 def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) -> None:
     with pytest.raises(WrongUse, match="it has no vehicle yet; magbridge fleet add --vehicle nemo"):
-        add_logs(empty, "nemo", MAY, [])
-    add_vehicle(empty, "comet", Vehicle())
-    count, (output,) = add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])
+        register.add_logs(empty, "nemo", MAY, [])
+    register.add_vehicle(empty, "comet", register.Vehicle())
+    count, (output,) = register.add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])
     assert count == 0
     assert "gone.nc: expected a file, there is none" in output
 
@@ -168,10 +157,10 @@ def test_a_fleet_toml_names_what_is_wrong(tmp_path: Path) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text('[vehicle.comet]\nparameter = ["battpos"]\n')
     with pytest.raises(ConfigError, match=r"vehicle\.comet\.parameter: unknown key"):
-        read_fleet(path)
+        register.read_fleet(path)
     path.write_text("[vehicle.comet.mass.battpos]\nat = [-0.5, 0.0]\ntravel = [0.0254, 0.0, 0.0]\n")
     with pytest.raises(ConfigError, match=r"vehicle\.comet\.mass.*\.at: expected `array` of length 3"):
-        read_fleet(path)
+        register.read_fleet(path)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +185,7 @@ def test_a_damaged_or_foreign_catalogue_is_one_line(
         assert code in {0, 1}
         assert all(text.startswith("magbridge: ") for text in err.splitlines())
     with pytest.raises(FormatError, match=words):
-        list(map(masses, vehicles(catalogue).values()))
+        list(map(register.masses, register.vehicles(catalogue).values()))
 
 
 # ---- A calibration made elsewhere: recorded, and learned from once, as far as its data determined it -----
@@ -222,7 +211,7 @@ def test_it_teaches_what_its_data_determined(
     log, cal = made
     for _ in range(2):
         command(*adding(catalogue, cal), "--date", "2026-05-01")
-    assert status(catalogue)["vehicles"][0]["given"] == 1
+    assert register.status(catalogue)["vehicles"][0]["given"] == 1
     (given,) = lessons(catalogue, "comet")
     known = fleet_of(catalogue, "comet").known("comet", "may")
     L = rescaling(known.exponents, known.parameters, load(cal).parameters, known.field, given.field)
@@ -230,8 +219,8 @@ def test_it_teaches_what_its_data_determined(
     assert (np.abs(L @ known.mean - load(cal).coefficients) < 3.0 * sigma).all()
     assert sigma[6:9].max() < 200.0  # against 3,000 of a vehicle of which nothing is known
     # the same data calibrated here, too, count once
-    add_logs(catalogue, "comet", Deployment("may", ()), [log])
-    (job,) = jobs(catalogue)
+    register.add_logs(catalogue, "comet", register.Deployment("may", ()), [log])
+    (job,) = register.jobs(catalogue)
     catalogue.add_tables(work(job, catalogue.results).tables)
     assert len(catalogue.rows("calibrations")) == 2
     (own,) = lessons(catalogue, "comet")
@@ -246,7 +235,7 @@ def test_what_does_not_fit_is_a_line(
     catalogue: Catalogue, made: tuple[Path, Path], tmp_path: Path, command: Command
 ) -> None:
     _, cal = made
-    add_vehicle(catalogue, "other", Vehicle(parameters=("ballast",)))
+    register.add_vehicle(catalogue, "other", register.Vehicle(parameters=("ballast",)))
     when = "--date", "2026-05-01"
     for arguments, words in (
         (adding(catalogue, cal), "expected --date YYYY-MM-DD, the day on which its deployment began"),
