@@ -259,7 +259,7 @@ def _counts(corrected: list[xr.Dataset], rows: int, source: Path) -> tuple[dict[
     return {"rows": samples, "flagged": flagged, "flags": flags, "left_out": left_out}, text
 
 
-SEAGLIDER_COUNT_NT = 100.0
+COMPASS_COUNT_NT = 100.0
 """Field of one count in most compasses of Seagliders, nT."""
 
 
@@ -275,9 +275,7 @@ def export(
     px4: Annotated[Path | None, Parameter(validator=cli.file_to_write(".params"))] = None,
     number: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=0, lte=3))] = 0,
     seaglider: Annotated[Path | None, Parameter(validator=cli.file_to_write(".cal"))] = None,
-    nt_per_count: Annotated[
-        float, Parameter(validator=validators.Number(gt=0, lte=1e5))
-    ] = SEAGLIDER_COUNT_NT,
+    nt_per_count: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=1e5))] = COMPASS_COUNT_NT,
     table: Annotated[Path | None, Parameter(validator=cli.file_to_write(".csv"))] = None,
     parameter: str = "",
     dip: Annotated[float, Parameter(validator=validators.Number(gt=-90, lt=90))] = 60.0,
@@ -363,13 +361,10 @@ def _in_c(known: mb.Calibration, folder: Path) -> dict[Path, str]:
     from magbridge.calibration.export_c import c_header, c_source
     from magbridge.calibration.export_scalar import scalar_header, scalar_source
 
-    texts = {
-        folder / "magbridge_calibration.h": c_header(known),
-        folder / "magbridge_calibration.c": c_source(known),
-    }
+    vector, scalar = (folder / f"magbridge_{kind}.h" for kind in ("calibration", "scalar"))
+    texts = {vector: c_header(known), vector.with_suffix(".c"): c_source(known)}
     for sensor in known.sensors[:1]:
-        texts[folder / "magbridge_scalar.h"] = scalar_header(sensor)
-        texts[folder / "magbridge_scalar.c"] = scalar_source(sensor)
+        texts |= {scalar: scalar_header(sensor), scalar.with_suffix(".c"): scalar_source(sensor)}
     return texts
 
 

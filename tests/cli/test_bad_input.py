@@ -65,12 +65,7 @@ def test_a_log_in_another_unit_is_not_corrected(
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        "correct log.nc -o x.nc",
-        "navigate log.nc -o x.nc",
-        "diagnose log.nc -o found",
-        "plan --mission log.nc",
-    ],
+    ["correct log.nc -o x.nc", "navigate log.nc -o x.nc", "diagnose log.nc -o out", "plan --mission log.nc"],
     ids=lambda arguments: arguments.split()[0],
 )
 def test_a_position_in_another_unit_is_refused(
