@@ -20,10 +20,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> None:
 
 
 def literal(figure: Figure) -> None:
-    """Make matplotlib draw the texts of a figure literally, because a ``$`` in a name would start a formula.
-
-    The labels of ticks do not change, because matplotlib itself formats them as formulas.
-    """
+    """Make matplotlib draw a ``$`` in the texts of a figure literally, except in its own labels of ticks."""
     axes = [axis for one in figure.axes for axis in (one.xaxis, one.yaxis)]
     ticks = {id(label) for axis in axes for label in axis.get_ticklabels(which="both")}
     for text in figure.findobj(Text):

@@ -281,11 +281,7 @@ def last_attempts(done: Iterable[Row]) -> dict[str, int]:
 
 
 def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> list[Row]:
-    """Return the valid rows of a table of results.
-
-    A row is valid if it comes from the last attempt at a job with the present logs and parameters, or if it
-    was made elsewhere.
-    """
+    """Return the rows of results of each present job's last attempt, and those that were made elsewhere."""
     names = {job.name for job in jobs(catalogue)}
     last = last_attempts(catalogue.rows("done"))
     wanted = [*columns, "job", "attempt"] if columns else ()

@@ -177,10 +177,7 @@ def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, 
 def series(
     reported: Iterable[TrackPoint], estimated: Iterable[TrackPoint], background: Background | None
 ) -> tuple[list[list[Any]], tuple[float, float, float, float] | None]:
-    """Return the data of the map's series, and the limits of the map (west, south, east, north), deg.
-
-    The series are the grid, the reported and the estimated track, the ellipse, and the last positions.
-    """
+    """Return grid, tracks, ellipse and last positions, and the limits (west, south, east, north), deg."""
     own, by_field = list(reported), list(estimated)
     shape = ellipse(by_field[-1]) if by_field else []
     tracks = [_places(own), _places(by_field)]

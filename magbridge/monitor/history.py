@@ -57,10 +57,7 @@ class Series:
         self._tiers = {name: deque[Point](maxlen=count) for name, count in points.items()}
 
     def add(self, time: float, value: float, two_sigma: float = 0.0) -> None:
-        """Add a value at `time` (s since 1970) with its 2-sigma; ignore invalid numbers and times.
-
-        If the clock was set back, remove the points that are later than `time`.
-        """
+        """Add a value at `time`, s since 1970, with its 2-sigma if it is valid; remove all later points."""
         if not (isfinite(value + two_sigma) and 0.0 <= time < LAST_YEAR):
             return
         value = max(-MAX_PLOTTED_VALUE, min(value, MAX_PLOTTED_VALUE))
@@ -175,11 +172,7 @@ class Alarms:
 
     @property
     def groups(self) -> list[Alarm]:
-        """Alarms of each cause as one alarm, whose key is the cause; the newest comes first.
-
-        The texts of active alarms stand first. The group is acknowledged if all its alarms are, and has the
-        count of its most frequent alarm.
-        """
+        """Alarms of each cause as one alarm, the newest first; the texts of active alarms stand first."""
         found: dict[str, list[Alarm]] = {}
         for alarm in self:
             found.setdefault(alarm.cause, []).append(alarm)
