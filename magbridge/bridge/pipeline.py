@@ -10,15 +10,7 @@ from msgspec.structs import replace
 
 from magbridge.align import Sample
 from magbridge.bridge import events
-from magbridge.bridge.events import (
-    Event,
-    Recorder,
-    StartEvent,
-    StateChanges,
-    beginning,
-    declarations,
-    port_number,
-)
+from magbridge.bridge.events import Event, Recorder, StartEvent, StateChanges, port_number
 from magbridge.bridge.learning import LearningService, first_calibration, open_learner
 from magbridge.bridge.position import LiveHeading, Position
 from magbridge.bridge.sensor import SensorStream, open_correction, open_drivers, other_calibrations
@@ -167,7 +159,7 @@ class Pipeline:
         parameters = self.component.parameters
         keys = [row.key for row in parameters.table.values()]
         settings = {key: parameters.value_of(key) for key in keys if key.startswith(("align.", "telemetry."))}
-        return declarations(self._config, [one.driver for one in self.streams], settings)
+        return events.declarations(self._config, [one.driver for one in self.streams], settings)
 
     @property
     def deadline(self) -> int:
@@ -390,7 +382,7 @@ class Pipeline:
 
     def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
         """Return the frames that record the start of the run, with these values of `parameters` by name."""
-        return beginning(self._config, self._start, self._calibration_id, parameters)
+        return events.beginning(self._config, self._start, self._calibration_id, parameters)
 
     def _status(self) -> dict[str, Any]:
         """Return the fields of MAG_STATUS about sensor, samples and log, by name."""

@@ -10,29 +10,17 @@ from typing import Final
 import numpy as np
 
 from magbridge.align import Sample
+from magbridge.calibration import heading
 from magbridge.calibration.correct import Corrector
-from magbridge.calibration.heading import (
-    NO_HEADING_FLAGS,
-    UNIFORM_SIGMA_DEG,
-    heading_of_sample,
-    model_declination_sigma,
-)
 from magbridge.calibration.model import Calibration
 from magbridge.config import HeadingOutput
 from magbridge.errors import MagbridgeError
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import HeldField, igrf
+from magbridge.link import telemetry
 from magbridge.link.component import Component
 from magbridge.link.estimates import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
 from magbridge.link.output import Rate
-from magbridge.link.telemetry import (
-    EKF_STATUS,
-    PX4_STATUS,
-    is_contradicted,
-    is_null_position,
-    own_time,
-    sent_us,
-)
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
 from magbridge.records import Corrected, Vector
@@ -102,7 +90,7 @@ class Position:
         has stayed beyond the jump for :data:`SUSPECT_US`. In the first minute, the new position is used.
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
-        if is_null_position(message):  # the autopilot does not know its position
+        if telemetry.is_null_position(message):  # the autopilot does not know its position
             return
         if not ALTITUDE_M[0] < altitude < ALTITUDE_M[1]:
             altitude = 0.0
@@ -212,7 +200,7 @@ class LiveHeading:
         self.is_sending = wanted.send is not None or wanted.nmea is not None
         self._wanted_tilt_sigma = wanted.tilt_sigma
         self._is_contradicted = False
-        self._read_time = own_time(ATTITUDE)
+        self._read_time = telemetry.own_time(ATTITUDE)
         self._attitude_us = -(1 << 62)
         self._roll = self._pitch = 0.0
         self._rates = (0.0, 0.0, 0.0)
@@ -229,11 +217,11 @@ class LiveHeading:
         if message.id == HEARTBEAT:
             self.stack = message["autopilot"]
             return
-        if message.id in (EKF_STATUS, PX4_STATUS):
-            self._is_contradicted = is_contradicted(message)
+        if message.id in (telemetry.EKF_STATUS, telemetry.PX4_STATUS):
+            self._is_contradicted = telemetry.is_contradicted(message)
             return
         clock = self._component.vehicle.clock
-        self._attitude_us = sent_us(self._read_time, message.payload, time_us, clock)
+        self._attitude_us = telemetry.sent_us(self._read_time, message.payload, time_us, clock)
         self._roll, self._pitch = message["roll"], message["pitch"]
         self._rates = message["rollspeed"], message["pitchspeed"], message["yawspeed"]
 
@@ -263,15 +251,15 @@ class LiveHeading:
             self._covariance_us, self._calibration = sample.time_us, corrector.calibration
         x, y, z = corrected.field_sigma
         published = x * x + y * y + z * z
-        magnetic, true, sigma = heading_of_sample(
+        magnetic, true, sigma = heading.heading_of_sample(
             corrected.field, roll, pitch, self._declination, self._covariance, self._turn,
             published if published < inf else inf, tilt_sigma_deg=degrees(tilt_sigma),
             declination_sigma_deg=self._declination_sigma,
         )  # fmt: skip
         if isnan(magnetic):
             return NO_ATTITUDE
-        if corrected.quality & NO_HEADING_FLAGS:
-            sigma = UNIFORM_SIGMA_DEG
+        if corrected.quality & heading.NO_HEADING_FLAGS:
+            sigma = heading.UNIFORM_SIGMA_DEG
         return Attitude(magnetic, true, sigma, self._declination, roll, pitch, self._rates, tilt_sigma)
 
     def _tilt(self, elapsed: float, stated: float) -> tuple[float, float, float]:
@@ -299,7 +287,7 @@ class LiveHeading:
         north, east, _ = main
         self._main, self._crustal = main, crustal
         self._declination = degrees(atan2(east, north))
-        sigma = model_declination_sigma(np.array([hypot(north, east)]), crustal)
+        sigma = heading.model_declination_sigma(np.array([hypot(north, east)]), crustal)
         self._declination_sigma = sigma.item()
 
     def send(self, attitude: Attitude, time_us: int) -> None:

@@ -15,13 +15,6 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 from pymavlink.dialects.v20 import all as upstream
-from pymavlink.dialects.v20.all import (
-    MAVLINK_IFLAG_SIGNED,
-    MAVLINK_SIGNATURE_BLOCK_LEN,
-    PROTOCOL_MARKER_V1,
-    PROTOCOL_MARKER_V2,
-    x25crc,
-)
 
 from magbridge.mavlink.enums import INVALID, LAYOUTS
 
@@ -205,10 +198,10 @@ def east_e7(longitude: float) -> int:
     return (round(longitude * 1e7) + TURN_E7 // 2) % TURN_E7 - TURN_E7 // 2
 
 
-V1: Final = PROTOCOL_MARKER_V1
-V2: Final = PROTOCOL_MARKER_V2
-SIGNED: Final = MAVLINK_IFLAG_SIGNED
-SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
+V1: Final = upstream.PROTOCOL_MARKER_V1
+V2: Final = upstream.PROTOCOL_MARKER_V2
+SIGNED: Final = upstream.MAVLINK_IFLAG_SIGNED
+SIGNATURE: Final = upstream.MAVLINK_SIGNATURE_BLOCK_LEN
 """Length of a signature, bytes: 1 of link id, 6 of time stamp, 6 of hash."""
 NOT_A_FRAME: Final = 0
 NEEDS_MORE: Final = -1
@@ -218,7 +211,7 @@ MAX_MESSAGE_ID: Final = 0xFFFF
 
 def checksum(data: bytes, extra: bytes) -> int:
     """Return the checksum of `data`, a frame's bytes after the magic byte, followed by its CRC_EXTRA."""
-    crc: int = x25crc(data + extra).crc
+    crc: int = upstream.x25crc(data + extra).crc
     return crc
 
 

@@ -55,12 +55,8 @@ def events(folder: Path) -> list[Event]:
     made = []
     for k in range(SAMPLES):
         time_us = START + k * 4_000_000
-        frame = autopilot.pack(
-            "GLOBAL_POSITION_INT",
-            time_boot_ms=k * 4000,
-            lat=round(PLACE[0] * 1e7) + k * 120,
-            lon=round(PLACE[1] * 1e7),
-        )
+        place = {"lat": round(PLACE[0] * 1e7) + k * 120, "lon": round(PLACE[1] * 1e7)}
+        frame = autopilot.pack("GLOBAL_POSITION_INT", time_boot_ms=k * 4000, **place)
         made.append(Event(time_us - 400_000, Channel.LINK, frame))
         yaw = 0.7 * (k // 40) + 0.1 * rng.normal()
         pitch = (0.45 if k // 40 % 2 else -0.4) + 0.05 * rng.normal()

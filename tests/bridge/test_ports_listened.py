@@ -37,10 +37,7 @@ def hmr(k: int) -> bytes:
 
 SPEAKERS = {
     "nmea": b"".join(nmea(f"GPGGA,12000{k},4736.0,N,05242.0,W") for k in range(5)),
-    "mavlink": b"".join(
-        Codec(7, 1).pack("HEARTBEAT", type=1, autopilot=3, system_status=4, mavlink_version=3)
-        for _ in range(5)
-    ),
+    "mavlink": 5 * Codec(7, 1).pack("HEARTBEAT", type=1, autopilot=3, system_status=4, mavlink_version=3),
     "hmr2300": b"".join(hmr(k) for k in range(9)),
     "text": b"".join(f"B={k}.5 X 1 2 3\r\n".encode() for k in range(9)),
     "bytes": bytes(range(128, 250)) * 3,

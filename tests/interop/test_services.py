@@ -80,13 +80,9 @@ def test_two_stations_and_a_vehicle_behind_a_router(
     rig.start_alone()
     with_a_log(rig, 1000)
     outs = [f"--out=udp:127.0.0.1:{one.line.getsockname()[1]}" for one in ears]
-    target = (
-        "--target-system=1",
-        "--target-component=191",
-        "--default-modules=link,output",
-        "--streamrate=-1",
-    )
-    start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{rig.port}", *outs, *target))
+    target = "--target-system=1", "--target-component=191", "--default-modules=link,output"
+    source = f"--master=udpin:127.0.0.1:{rig.port}"
+    start_peer(rig, proxy(python, source, *outs, *target, "--streamrate=-1"))
     rig.until(lambda: all(one.of("MAG_FIELD") or one.of("HEARTBEAT") for one in ears), 60)
     for one in ears:
         one.send_message("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)

@@ -145,10 +145,8 @@ def test_a_file_by_reads_and_its_checksum(server: FtpServer, folder: Path) -> No
     station, data = Station(server), (folder / NAMES[1]).read_bytes()
     session = station.open(f"@MAV_LOG/{NAMES[1]}")
     for offset in (0, 100, len(data) - 5):
-        assert station.one(Opcode.READ, session=session, offset=offset, size=DATA) == (
-            Opcode.ACK,
-            data[offset : offset + DATA],
-        )
+        piece = Opcode.ACK, data[offset : offset + DATA]
+        assert station.one(Opcode.READ, session=session, offset=offset, size=DATA) == piece
     for offset in (len(data), 0xFFFFFFFF):
         assert station.refused(Opcode.READ, session=session, offset=offset, size=DATA) is Error.END_OF_FILE
         assert station.refused(Opcode.BURST, session=session, offset=offset, size=DATA) is Error.END_OF_FILE
