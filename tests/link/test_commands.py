@@ -1,5 +1,6 @@
 """Test that commands are acknowledged to their sender."""
 
+from itertools import pairwise
 from math import inf, nan
 from typing import Any
 
@@ -279,6 +280,9 @@ def test_two_sources_of_one_parameter(
     reported = [text for _, text in output.texts]
     refused = {who for (_, who), good in zip(order, admitted, strict=True) if not good}
     assert {who for who in refused if f"battpos also from 1:{who}: not used" in reported} == refused
+    used = [who for (_, who), good in zip(order, admitted, strict=True) if good]
+    changes = [f"battpos now from 1:{new}, not {old}" for old, new in pairwise(used) if new != old]
+    assert [text for text in reported if "now from" in text] == changes
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Test that any field of any message can become a parameter."""
 
 import time
-from math import nan
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import pytest
 
 from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
-from magbridge.link.telemetry import TelemetryMap
+from magbridge.link.telemetry import TelemetryMap, is_possible
 from magbridge.link.vehicle import VehicleClock
 from magbridge.mavlink import SECRET, Codec, LogReader
 from magbridge.mavlink.messages import EXTRA, spec
@@ -120,6 +120,22 @@ def test_mistakes_are_one_clear_line(
 ) -> None:
     with pytest.raises(ConfigError, match=complaint):
         TelemetryMap({"p": Telemetry(*source, match=match)}, path=Path("b.toml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "possible"),
+    [
+        ("ODOMETRY", {"q": (0.6, 0.0, -0.8, 0.0), "x": nan}, True),
+        ("ODOMETRY", {"q": (1.2, 0.0, 0.0, 0.0)}, False),
+        ("ODOMETRY", {"vx": inf}, False),
+        ("ATTITUDE", {"yaw": -6.3}, True),
+        ("ATTITUDE", {"yaw": nan}, False),
+        ("GPS_RAW_INT", {"lat": -900_000_001}, False),
+    ],
+)
+def test_values_that_no_vehicle_has_are_impossible(name: str, fields: dict[str, Any], possible: bool) -> None:
+    (message,) = Codec(0, 0).parse(Codec(1, 1).pack(name, **fields))
+    assert is_possible(message) is possible
 
 
 def test_every_numeric_field_of_every_message_maps() -> None:
