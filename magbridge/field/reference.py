@@ -7,6 +7,7 @@ The column ``daily_variation`` of a log holds this variation: a base station's f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,9 +26,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "missing_anomaly", "other_units",
-    "placed", "positions", "reference_field", "require_date", "separate_observatories", "sphere_radius",
-    "station_gaps", "variation_level_sigma", "with_daily_variation", "with_true_heading",
+    "MAIN_FIELD_RANGE_NT", "UNRECORDED_SIGMA_NT", "about_mean", "earth_field", "main_field", "mean_sigma",
+    "missing_anomaly", "other_units", "placed", "positions", "reference_field", "require_date",
+    "separate_observatories", "sphere_radius", "station_gaps", "variation_level_sigma",
+    "with_daily_variation", "with_true_heading",
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
@@ -286,6 +288,11 @@ MAX_STATION_GAP = 3.0, 60.0
 """Longest time between two samples of a station, or beyond its ends, in intervals and at least in s."""
 DAY_S, DAILY_RANGE_NT = 86_400.0, 45.0
 """Length of a day, s, and usual range of the quiet daily variation, nT: the geometric mean of 20 and 100."""
+DAILY_SIGMA_NT, DISTURBANCE_SIGMA_NT = DAILY_RANGE_NT / 8.0**0.5, 20.0
+"""Standard deviation of the quiet daily variation about its mean, nT, as that of a sine of its range, and of
+disturbances over years, about that of the hourly index Dst."""
+UNRECORDED_SIGMA_NT = hypot(DAILY_SIGMA_NT, DISTURBANCE_SIGMA_NT)
+"""1-sigma of the field's variation in time without a base station, nT."""
 
 
 def separate_observatories(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
@@ -344,23 +351,29 @@ def _covered(t: FloatArray, time: FloatArray) -> BoolArray:
 def _level_sigma(time: FloatArray, variation: FloatArray) -> float:
     """Return the 1-sigma, nT, of the median of a base station's variation (n,) as that of all days.
 
+    A record shorter than a day lacks a part of the daily variation.
+    """
+    if not len(variation):
+        return 0.0
+    unseen = max(1.0 - (time[-1] - time[0]) / DAY_S, 0.0)
+    return hypot(mean_sigma(variation), DAILY_SIGMA_NT * sqrt(unseen))
+
+
+def mean_sigma(variation: FloatArray) -> float:
+    """Return the 1-sigma of the mean of a `variation` (n,) in time, as that of all times.
+
     Notes
     -----
     Values of the autocorrelation ρ hold ``N = n / (1 + 2 Σ ρ)`` independent ones, the sum up to the first ρ
-    that is not positive, and their mean has the variance ``s² / (N - 1)``. A record shorter than a day also
-    lacks a part of the daily variation: a sine of range R has the variance ``R² / 8`` about its mean.
+    that is not positive, and their mean has the variance ``s² / (N - 1)``.
     """
     size = len(variation)
-    if not size:
-        return 0.0
     # N from the autocovariance, by the power spectrum of the padded record.
     power = np.abs(np.fft.rfft(variation - variation.mean(), 2 * size)) ** 2
     autocovariance = np.fft.irfft(power)[:size]
     positive = autocovariance[: int((autocovariance <= 0.0).argmax()) or size]
     independent = size * autocovariance[0] / (2.0 * positive.sum() - autocovariance[0] or 1.0)
-    # The mean's variance, and that of the daily variation in the part of a day that is not recorded.
-    unseen = max(1.0 - (time[-1] - time[0]) / DAY_S, 0.0)
-    return float(np.sqrt(variation.var() / max(independent - 1.0, 1.0) + unseen * DAILY_RANGE_NT**2 / 8.0))
+    return float(variation.std() / sqrt(max(independent - 1.0, 1.0)))
 
 
 def variation_level_sigma(log: xr.Dataset) -> float:

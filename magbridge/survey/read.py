@@ -27,7 +27,14 @@ from magbridge.diagnostics import Diagnostic
 from magbridge.errors import DataError, FormatError
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
-from magbridge.field.reference import main_field, placed, positions, require_date, variation_level_sigma
+from magbridge.field.reference import (
+    UNRECORDED_SIGMA_NT,
+    main_field,
+    placed,
+    positions,
+    require_date,
+    variation_level_sigma,
+)
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 from magbridge.survey.samples import Samples
@@ -97,7 +104,8 @@ def read_table(path: Path) -> Samples:
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     place = np.stack(separation(*origin, latitude, longitude), axis=1)
     no_time = np.full(len(value), np.nan)
-    return Samples(place, depth, no_time, value, line, tie, origin, line_names=line_names).part(known)
+    samples = Samples(place, depth, no_time, value, line, tie, origin, line_names=line_names)
+    return replace(samples.part(known), level_sigma=UNRECORDED_SIGMA_NT)
 
 
 def read_points(
@@ -179,7 +187,7 @@ def located(ds: xr.Dataset, value: FloatArray, name: str = "a field") -> tuple[S
         if "line_type" in ds:
             tie = np.isin(np.char.upper(ds["line_type"].to_numpy().astype(str)), TIE)
     time = np.asarray(ds["time"].to_numpy(), float)
-    level_sigma = variation_level_sigma(ds)
+    level_sigma = variation_level_sigma(ds) if "daily_variation" in ds else UNRECORDED_SIGMA_NT
     samples = Samples(
         place, depth, time, value, line, tie, origin, level_sigma=level_sigma, line_names=line_names
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from magbridge.columns import CHANNELS
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, DataError
 from magbridge.estimation.residual import robust_scale
+from magbridge.field.reference import mean_sigma
 from magbridge.survey.alignment import ScalarTerms, align
 from magbridge.survey.gridding import Gridded, gridded
 from magbridge.survey.read import corrected_by_others, from_vector, joined, scalar_rows
@@ -47,7 +49,7 @@ class Result:
     """Result of a survey: samples, gridded field, crossovers and warnings."""
 
     samples: Samples
-    """Corrected samples, without those far from all others."""
+    """Corrected samples, without those far from all others; `level_sigma` is that of the map."""
     gridded: Gridded
     found: Crossovers
     before: FloatArray
@@ -102,6 +104,8 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
                 f"the map's equations are singular to rounding ({problem}): survey fewer lines at once, or "
                 f"thin the log{left_out}"
             ) from problem
+    # Levels and slow changes are about their mean over the survey, which is not that of all times.
+    samples = replace(samples, level_sigma=hypot(samples.level_sigma, mean_sigma(found.levels)))
     ties = crossovers(samples.place, samples.line)
     B = found.at_samples(samples)
     residual = samples.value - found.levels - B
@@ -228,7 +232,8 @@ def summary(result: Result) -> str:
     crust = known["crustal_field"]
     return (
         f"{known['samples']} samples on {counted(known['lines'], 'line')}, {ties}; crustal field of "
-        f"{crust['amplitude_nT']:.0f} nT over {crust['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
+        f"{crust['amplitude_nT']:.0f} nT over {crust['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT; "
+        f"level known to {known['level_sigma_nT']:.1f} nT (1-sigma)"
         + (f"; {result.scalar.summary()}" if result.scalar else "")
     )
 

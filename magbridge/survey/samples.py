@@ -50,7 +50,7 @@ class Samples:
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     """Change (n, r), nT, of every sample with 1-sigma of each uncertain combination of coefficients."""
     level_sigma: float = 0.0
-    """1-sigma of the constant error of all samples (the reference bias), nT."""
+    """1-sigma of the constant error of all samples (reference bias, variation in time), nT."""
     left_out: tuple[Diagnostic, ...] = ()
     """Why samples of the logs are not among these."""
     line_names: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from magbridge.cli.common import by_base_station
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.igrf import igrf
-from magbridge.field.reference import variation_level_sigma, with_daily_variation
+from magbridge.field.reference import UNRECORDED_SIGMA_NT, variation_level_sigma, with_daily_variation
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment
 from magbridge.survey.read import corrected_by_others
@@ -115,7 +115,7 @@ def test_the_level_of_a_base_station_is_uncertain(hours: float) -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(off) / np.square(sigma))) < 1.25
     exact = found.assign(level_sigma=("time", np.full(time.size, 100.0)))
     assert corrected_by_others(exact).level_sigma == pytest.approx(np.hypot(100.0, sigma[-1]))
-    assert corrected_by_others(log).level_sigma == 0.0
+    assert corrected_by_others(log).level_sigma == UNRECORDED_SIGMA_NT > max(sigma)
 
 
 def test_whole_days_of_a_base_station_determine_its_level() -> None:

@@ -134,6 +134,37 @@ def test_a_base_station_takes_a_daily_variation_off(command: Command, tmp_path: 
     assert np.std(error) < 1.25 * np.median(sigma)
 
 
+def test_without_a_base_station_the_level_is_less_certain_than_with_one(
+    command: Command, tmp_path: Path
+) -> None:
+    """Four hours of a daily variation of 30 nT are an error of the level, which the sigma has to cover."""
+    place = with_ways([lanes(0), lanes(1)])
+    time = STEP * np.arange(-10.0, len(place) + 10.0)
+    varied = 30.0 * np.sin(2.0 * np.pi * time / 86_400.0)
+    raw = flown("comet", place)
+    columns = {
+        "anomaly": ("time", rock(place) + varied[10:-10], {"units": "nT"}),
+        "line": ("time", (np.arange(len(place)) // 60).astype(float)),
+    }
+    log = raw.drop_vars(["mag_x", "mag_y", "mag_z"]).assign(columns)
+    write(log, tmp_path / "log.nc")
+    base = xr.Dataset({"total_field": ("time", 53_000.0 + varied, {"units": "nT"})}, {"time": START + time})
+    write(base, tmp_path / "base.nc")
+    words = "survey", tmp_path / "log.nc", "-o", tmp_path / "map.nc"
+    with_base = command.json(*words, "--base", tmp_path / "base.nc")["level_sigma_nT"]
+    level_sigma = command.json(*words)["level_sigma_nT"]
+    assert level_sigma > with_base > 5.0
+    grid = read_grid(tmp_path / "map.nc")
+    assert grid.level_sigma == level_sigma
+    latitude, longitude = offset(*ORIGIN, place[::5, 0], place[::5, 1])
+    error = np.mean(grid.evaluate(longitude, latitude).anomaly - rock(place[::5]))
+    assert error == pytest.approx(np.mean(varied), abs=2.0)
+    assert 0.3 < error / level_sigma < 1.5
+    assert f"level known to {level_sigma:.1f} nT" in command(*words).out
+    write(log.assign(level_sigma=("time", np.full(len(place), 100.0))), tmp_path / "log.nc")
+    assert command.json(*words)["level_sigma_nT"] == pytest.approx(np.hypot(100.0, level_sigma))
+
+
 def test_what_correct_has_flagged_and_what_has_no_place_stay_out_of_the_map(
     command: Command, tmp_path: Path
 ) -> None:
