@@ -57,7 +57,7 @@ class MapOptions:
         Altitude in m to which the map is continued upward; by default the altitude of the survey.
     predict
         A table of points with longitude and latitude (and height or depth). The output is then a table of
-        anomaly and anomaly_sigma at these points, instead of a map.
+        anomaly, anomaly_sigma and level_sigma at these points, instead of a map.
     geotiff
         A file for the map as GeoTIFF, in addition.
     tracks
@@ -228,7 +228,7 @@ def _predict(done: Result, points: Path, output: Path) -> None:
 
     longitude, latitude, depth, place = read_points(points, done.samples.origin)
     anomaly, sigma = done.gridded.evaluate(place, depth)
-    write_points(longitude, latitude, anomaly, sigma, output)
+    write_points(longitude, latitude, anomaly, sigma, done.samples.level_sigma, output)
 
 
 def _map(done: Result, output: Path, products: MapOptions) -> None:

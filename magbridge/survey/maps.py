@@ -154,11 +154,17 @@ def write_crossovers(
 
 
 def write_points(
-    longitude: FloatArray, latitude: FloatArray, anomaly: FloatArray, sigma: FloatArray, path: Path
+    longitude: FloatArray,
+    latitude: FloatArray,
+    anomaly: FloatArray,
+    sigma: FloatArray,
+    level_sigma: float,
+    path: Path,
 ) -> None:
-    """Write predictions at points, (n,) each: deg, nT, and their 1-sigma."""
-    heads = ["longitude", "latitude", "anomaly [nT]", "anomaly_sigma [nT]"]
-    _write_csv(path, heads, [longitude, latitude, anomaly.round(3), sigma.round(3)])
+    """Write predictions at points, (n,) each: deg, nT, their 1-sigma, and that of their common level."""
+    heads = ["longitude", "latitude", "anomaly [nT]", "anomaly_sigma [nT]", "level_sigma [nT]"]
+    level = np.full(len(anomaly), round(level_sigma, 3))
+    _write_csv(path, heads, [longitude, latitude, anomaly.round(3), sigma.round(3), level])
 
 
 def _write_csv(path: Path, heads: list[str], columns: Sequence[NDArray[Any]]) -> None:

@@ -299,10 +299,11 @@ def test_command_predicts_at_points(command: Command, table: Path) -> None:
     points = table.parent / "points.csv"
     points.write_text("longitude,latitude\n-57.9,49.5\n-57.89,49.51\n")
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:201]))  # four lines of ten
-    command("survey", table, "--predict", points, "-o", table.parent / "out.csv")
+    facts = command.json("survey", table, "--predict", points, "-o", table.parent / "out.csv")
     rows = (table.parent / "out.csv").read_text().splitlines()
-    assert rows[0] == "longitude,latitude,anomaly [nT],anomaly_sigma [nT]"
+    assert rows[0] == "longitude,latitude,anomaly [nT],anomaly_sigma [nT],level_sigma [nT]"
     assert len(rows) == 3
+    assert float(rows[1].split(",")[-1]) == pytest.approx(facts["level_sigma_nT"], abs=1e-3)
     points.write_text("longitude,latitude\n-57.9,49.5\n,49.51\n")
     error = command("survey", table, "--predict", points, "-o", table.parent / "none.csv", code=1).err
     assert "points.csv: expected longitude and latitude in every row, 1 lack one" in error
