@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "HEADINGS", "NT_PER_UNIT",
-    "TEMPERATURE", "YEAR_1980", "Column", "absent", "counts_from_boot", "decoded", "factor", "may_be",
-    "require", "require_units", "time_columns", "usual",
+    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "HEADINGS", "HEIGHT_GUESS",
+    "NT_PER_UNIT", "TEMPERATURE", "YEAR_1980", "Column", "absent", "bare", "counts_from_boot", "decoded",
+    "factor", "is_height", "may_be", "require", "require_units", "time_columns", "unit_of_height", "usual",
 ]  # fmt: skip
 
 
@@ -64,12 +64,19 @@ _FACTORS = {
     ("rad", "deg"): 57.29577951308232,
     ("cm", "m"): 1e-2,
     ("km", "m"): 1e3,
+    ("ft", "m"): 0.3048,
     ("cm/s", "m/s"): 1e-2,
 }
 _SAME = {other: unit for unit, others in _TABLES["spellings"].items() for other in others}
 """Spelling of a unit in other programs' files -> unit of magbridge."""
 _CHARACTERS = str.maketrans({"²": "2", "³": "3", "\N{GREEK SMALL LETTER MU}": "\N{MICRO SIGN}"})
 _POWER = re.compile(r"(\^|\*\*)(?=[-\d])")
+_HEIGHT = re.compile(
+    r"(gps|gnss|msl|ellipsoid(al)?|baro|barometric)?(alt|altitude|height|hohe)"
+    r"(msl|amsl|asl|gps|ellipsoid(al)?|wgs84)?(m|ft|feet)?"
+)
+HEIGHT_GUESS = "depth is minus {!r}, as height above the sea"
+"""Assumption about a column that is called a height (:func:`is_height`)."""
 
 
 MAX_NAMES = 60
@@ -136,6 +143,21 @@ def usual(unit: str) -> str:
     unit = _POWER.sub("", unit.strip().translate(_CHARACTERS))
     written_out = unit.lower().replace("-", "").replace(" ", "").replace("teslas", "tesla")
     return _SAME.get(unit) or (_SAME.get(written_out, unit) if len(written_out) > 4 else unit)
+
+
+def bare(name: str) -> str:
+    """Return a name in lower case, without punctuation."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def is_height(name: str) -> bool:
+    """Return True if a column is called a height above the sea, as ``altitude`` or ``gps_alt_m``."""
+    return _HEIGHT.fullmatch(bare(name)) is not None
+
+
+def unit_of_height(name: str, unit: str) -> str:
+    """Return the unit of a height: `unit` if it is declared, else the one in its name, else m."""
+    return unit if unit not in ("", "1") else "ft" if bare(name).endswith(("ft", "feet")) else "m"
 
 
 def may_be(unit: str, other_unit: str) -> bool:

@@ -5,14 +5,23 @@ Readers of files return Datasets in standard units with increasing times; other 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.columns import COLUMNS, absent, factor, time_columns
+from magbridge.columns import (
+    COLUMNS,
+    HEIGHT_GUESS,
+    absent,
+    factor,
+    is_height,
+    time_columns,
+    unit_of_height,
+)  # fmt: skip
 from magbridge.errors import FormatError, WrongUse
 
 if TYPE_CHECKING:
@@ -20,11 +29,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "YEAR_10000", "conversion", "disorder", "disordered", "expect", "expect_number", "expected_time",
-    "in_standard_units", "increasing", "standard_log",
+    "in_standard_units", "increasing", "standard_log", "with_depth", "with_guesses",
 ]  # fmt: skip
 
 YEAR_10000 = 253_402_300_800.0
 """Start of the year 10000, s since 1970; a later time is in another unit."""
+HEIGHTS = {
+    "altitude", "height_above_geopotential_datum", "height_above_mean_sea_level",
+    "height_above_reference_ellipsoid",
+}  # fmt: skip
+"""Standard names of the CF Conventions for heights above the sea; ``height`` is one above the ground."""
 
 
 def expect(name: str, value: object, kind: type, origin: str) -> None:
@@ -55,7 +69,8 @@ def standard_log(log: xr.Dataset) -> xr.Dataset:
 def in_standard_units(log: xr.Dataset) -> xr.Dataset:
     """Return a log with its columns converted to the units of :data:`~magbridge.columns.COLUMNS`.
 
-    Times may be ``datetime64``, or numbers of s since 1970-01-01 UTC or of a unit ``... since ...``.
+    Times may be ``datetime64``, or numbers of s since 1970-01-01 UTC or of a unit ``... since ...``. A height
+    becomes the depth (:func:`with_depth`).
 
     WrongUse: `log` is not a Dataset. FormatError: the times are missing, or are neither numbers nor
     ``datetime64``; a unit does not fit its column.
@@ -85,7 +100,40 @@ def in_standard_units(log: xr.Dataset) -> xr.Dataset:
             wanted = COLUMNS[name].units if name in COLUMNS else "nT"
             scaled = column.dims, column.to_numpy() * scale, column.attrs | {"units": wanted}
             log = log.assign({name: scaled})
+    return with_depth(log)
+
+
+def with_depth(log: xr.Dataset) -> xr.Dataset:
+    """Return a log with a height above the sea as ``depth``, its opposite, if it has positions but no depth.
+
+    The attributes ``guessed`` and ``history`` state it.
+    """
+    if "depth" in log.variables or "latitude" not in log.variables:
+        return log
+    place = log["latitude"]
+    for name, column in ((str(key), column) for key, column in log.variables.items()):
+        standard = column.attrs.get("standard_name")
+        above_sea = standard in HEIGHTS if standard else is_height(name)
+        if not above_sea or column.dims not in {(), place.dims}:
+            continue
+        unit = unit_of_height(name, str(column.attrs.get("units", "")))
+        if scale := factor(unit, "depth"):
+            values = np.broadcast_to(-scale * column.to_numpy(), place.shape)
+            depth = place.dims, values, COLUMNS["depth"]._asdict()
+            attrs = with_guesses(log.attrs.get("source", ""), log.attrs, [HEIGHT_GUESS.format(name)])
+            return log.drop_vars(name).assign(depth=depth).assign_attrs(attrs)
     return log
+
+
+def with_guesses(source: str, attrs: Mapping[Any, Any], guesses: Sequence[str]) -> dict[Any, Any]:
+    """Return the attributes with `guesses`, the assumptions under which a log was read, also as history."""
+    if not guesses:
+        return dict(attrs)
+    note = "; ".join(guesses)
+    history = [str(attrs["history"])] if "history" in attrs else []
+    history.append(f"{source} was read with: {note}")
+    before = [str(attrs["guessed"])] if "guessed" in attrs else []
+    return {**attrs, "guessed": "; ".join([*before, note]), "history": "\n".join(history)}
 
 
 def _moments(source: str, time: xr.DataArray) -> xr.DataArray:

@@ -21,7 +21,7 @@ from typing import Any, Self
 import xarray as xr
 
 from magbridge.columns import counts_from_boot, decoded, require, usual
-from magbridge.datasets import in_standard_units, increasing
+from magbridge.datasets import in_standard_units, increasing, with_depth
 from magbridge.errors import AbsentColumns, DataError, FormatError, WriteError, WrongUse
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
@@ -285,6 +285,7 @@ def _chunks(
             numbered = ((by_columns(piece, options.compass), rows) for piece, rows in numbered)
         if options.declared.columns and not form.maps_columns:
             numbered = ((renamed(piece, options.declared), rows) for piece, rows in numbered)
+        numbered = ((with_depth(piece), rows) for piece, rows in numbered)
         for part in checked(path, numbered, strict=options.strict):
             if options.strict and (lost := passed_over(part.attrs)):
                 raise FormatError(path, f"expected a log without {' '.join(lost)}, as --strict was given")

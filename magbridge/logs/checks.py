@@ -25,11 +25,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
-from magbridge.columns import CHANNEL_TIMES, CHANNELS, usual
+from magbridge.columns import CHANNEL_TIMES, CHANNELS, bare, usual
 from magbridge.datasets import YEAR_10000, disorder, disordered, expected_time
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
-from magbridge.logs.mapping import PATTERNS, bare, is_called
+from magbridge.logs.mapping import PATTERNS, is_called
 from magbridge.records import NULL_POSITION_DEG
 
 Piece = tuple[xr.Dataset, Sequence[int]]

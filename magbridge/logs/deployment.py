@@ -20,9 +20,9 @@ from magbridge.columns import (
     counts_from_boot,
     usual,
 )  # fmt: skip
-from magbridge.datasets import conversion, in_standard_units, standard_log
+from magbridge.datasets import conversion, in_standard_units, standard_log, with_guesses
 from magbridge.errors import AbsentColumns, FormatError
-from magbridge.logs.mapping import ColumnMapping, ColumnSource, split
+from magbridge.logs.mapping import ColumnMapping, ColumnSource, guess_of_height, split
 from magbridge.records import Quality
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
@@ -166,6 +166,7 @@ def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
         part = deployment(dataset.attrs["source"], dataset["time"].to_numpy(), {name: values}, {name: unit})
         taken[name] = part[name]
     named = dataset.drop_vars(set(sources.values()) - declaration.columns.keys()).assign(taken)
+    named.attrs = with_guesses(named.attrs["source"], named.attrs, guess_of_height(declaration))
     reference = declaration.heading_reference
     return named.assign_attrs({"heading_reference": reference}) if reference else named
 
@@ -262,16 +263,6 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
 def with_notes(dataset: xr.Dataset, lines: Sequence[str]) -> xr.Dataset:
     """Return the deployment with further notes for the user."""
     return dataset.assign_attrs({NOTES: "\n".join([*noted(dataset.attrs), *lines])}) if lines else dataset
-
-
-def with_guesses(path: Path, attrs: Mapping[str, Any], guesses: Sequence[str]) -> dict[str, Any]:
-    """Return the attributes with `guesses`, the assumptions under which a file was read, also as history."""
-    if not guesses:
-        return dict(attrs)
-    note = "; ".join(guesses)
-    before = [str(attrs[HISTORY_ATTRIBUTE])] if HISTORY_ATTRIBUTE in attrs else []
-    history = "\n".join([*before, f"{path.name} was read with: {note}"])
-    return {**attrs, GUESSED_ATTRIBUTE: note, HISTORY_ATTRIBUTE: history}
 
 
 def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:

@@ -9,13 +9,12 @@ import xarray as xr
 from msgspec import to_builtins
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import AGE, CHANNELS, COLUMNS, counts_from_boot, usual
+from magbridge.columns import AGE, CHANNELS, COLUMNS, HEIGHT_GUESS, counts_from_boot, is_height, usual
 from magbridge.datasets import in_standard_units
 from magbridge.field.igrf import magnitude
 from magbridge.logs.checks import states_validity
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
-from magbridge.logs.mapping import is_called
 from magbridge.logs.naming import earthly_units
 
 HORIZONTAL_POSITION = ("latitude", "longitude")
@@ -180,11 +179,11 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
     depth = log["depth"].dropna("time").to_numpy() if "depth" in log else np.empty(0)
-    heights = [one["name"] for one in columns if is_called(one["name"], "height")]
+    heights = [one["name"] for one in columns if is_height(one["name"])]
     if "depth" not in log and heights:
         hints.append(f'{heights[0]} is not used: as height above the sea, --column depth="{heights[0]}"')
-    is_height = "depth is minus" in str(log.attrs.get("guessed", ""))
-    if len(depth) and (middle := float(np.median(depth))) < -ABOVE and not is_height:
+    negated = HEIGHT_GUESS.partition("{")[0] in str(log.attrs.get("guessed", ""))
+    if len(depth) and (middle := float(np.median(depth))) < -ABOVE and not negated:
         hints.append(f"depth is {middle:.4g} m (median): if it counts upwards, scale = -1 in columns.toml")
     if moving := movers(log):
         hints.append(f"may move the field, for --parameter: {' '.join(moving)} (auto: those that do)")

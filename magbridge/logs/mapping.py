@@ -21,7 +21,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import msgspec
 
-from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
+from magbridge.columns import COLUMNS, HEIGHT_GUESS, NT_PER_UNIT, bare, is_height, unit_of_height, usual
 from magbridge.errors import WrongUse
 from magbridge.toml import Table, check_entries, convert, load_toml
 
@@ -104,10 +104,25 @@ class Options:
 
     @cached_property
     def declared(self) -> ColumnMapping:
-        """Combined declarations of `columns` and `column`; raise ConfigError or WrongUse for a wrong one."""
+        """Combined declarations of `columns` and `column`; raise ConfigError or WrongUse for a wrong one.
+
+        A height that is declared as the depth is read as its opposite.
+        """
         every = declared(self.column, self.columns)
         own = {name: source for name, source in every.columns.items() if name not in self.elsewhere}
+        depth = own.get("depth", ColumnSource())
+        name, unit = split(depth.heading or "")
+        if is_height(name) and depth.scale == 1.0:
+            in_feet = unit_of_height(name, depth.unit or unit) == "ft"
+            own["depth"] = msgspec.structs.replace(depth, unit="ft" if in_feet else depth.unit, scale=-1.0)
         return msgspec.structs.replace(every, columns=own)
+
+
+def guess_of_height(declared: ColumnMapping) -> list[str]:
+    """Return the assumption, if any, that the column declared as depth counts upwards."""
+    depth = declared.columns.get("depth", ColumnSource())
+    is_opposite = depth.scale < 0.0 and is_height(split(depth.heading or "")[0])
+    return [HEIGHT_GUESS.format(depth.heading)] if is_opposite else []
 
 
 def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:
@@ -167,11 +182,6 @@ def split(heading: str) -> tuple[str, str]:
             if header and usual(tail) in NT_PER_UNIT and tail not in {"T", "G"}:
                 return header.strip(), tail
     return name, unit.strip()
-
-
-def bare(name: str) -> str:
-    """Return a name in lower case, without punctuation."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def is_called(name: str, kind: str) -> bool:

@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usual
+from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, bare, usual
 from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows, numbers_of
-from magbridge.logs.mapping import CELL_NUMBER, NAMES, PATTERNS, ColumnSource, bare, is_called, is_unit, split
+from magbridge.logs.mapping import CELL_NUMBER, NAMES, PATTERNS, guess_of_height, is_called, is_unit, split
 
 AXES = "xyz"
 PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
@@ -38,8 +37,6 @@ ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 HOUR = re.compile(
     r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
 )
-HEIGHT_UNITS = {"m": 1.0, "ft": 0.3048, "feet": 0.3048, "km": 1e3}
-"""Unit of a height -> its size, m."""
 DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
 """A cell that is a date with its time of day."""
 CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
@@ -70,8 +67,7 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     lines = [k for k, name in enumerate(layout.names) if is_called(name, "line")]
     if layout.foreign and len(lines) == 1:
         layout = layout.renamed({lines[0]: "line"})
-    layout = _with_height(_with_utm(layout))
-    layout = _with_time(layout, rows)
+    layout = _with_time(_with_utm(layout).guessing(*guess_of_height(layout.declared)), rows)
     return _without_texts(_with_total(_with_units_of_axes(layout, rows), rows), rows)
 
 
@@ -165,31 +161,6 @@ def _with_utm(layout: Layout) -> Layout:
         return layout
     layout = layout.renamed(names).with_units(dict.fromkeys(HEMISPHERES, *zones))
     return layout.guessing(f"position in the projection {layout.projection}")
-
-
-def _with_height(layout: Layout) -> Layout:
-    """Return the layout with the opposite of a height as ``depth``, if a log with positions has no depth."""
-    declared = layout.declared.columns.get("depth", ColumnSource())
-    if "depth" not in layout.names:
-        heights = [k for k, name in enumerate(layout.names) if is_called(name, "height")]
-        if not (layout.foreign and heights and "latitude" in layout.names):
-            return layout
-        k = heights[0]
-    elif is_called(split(declared.heading or "")[0], "height") and declared.scale == 1.0:
-        k = layout.names.index("depth")
-    else:
-        return layout
-    name, unit = split(layout.headings[k])
-    unit = layout.units.get(layout.names[k], unit) or ("ft" if bare(name).endswith(("ft", "feet")) else "m")
-    if unit not in HEIGHT_UNITS:
-        return layout
-    source = msgspec.structs.replace(
-        declared, heading=layout.headings[k], unit="m", scale=-HEIGHT_UNITS[unit]
-    )
-    columns = {**layout.declared.columns, "depth": source}
-    layout = layout.renamed({k: "depth"}).with_units({"depth": "m"})
-    layout = replace(layout, declared=msgspec.structs.replace(layout.declared, columns=columns))
-    return layout.guessing(f"depth is minus {layout.headings[k]!r}, as height above the sea")
 
 
 def _with_time(layout: Layout, rows: Rows) -> Layout:

@@ -117,6 +117,11 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
     # UDUNITS, and so a file of this writer, calls the unit of an angle degree
     units = {name: "deg" if unit == "degree" else unit for name, unit in units.items()}
     meanings = {one.name: str(getattr(one.variable, "long_name", "")) for one in columns}
+    standards = {
+        one.name: str(one.variable.standard_name)
+        for one in columns
+        if one.name not in COLUMNS and hasattr(one.variable, "standard_name")
+    }
     try:
         attrs = {key: value for key, value in file.__dict__.items() if key not in GENERATED}
     except AttributeError as error:  # netCDF4 raises it for a damaged attribute
@@ -142,6 +147,8 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
         time, values, kept = without_invalid(faults, time, values, numbers, rules, codes=not ours)
         counts, lines = faults.since_last()
         piece = deployment(path, time, values, units, attrs, meanings)
+        for name, standard in standards.items():
+            piece[name].attrs["standard_name"] = standard
         yield with_losses(piece, counts, [*lines, *(() if row else left_out)]), kept
 
 

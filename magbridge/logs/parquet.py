@@ -15,9 +15,10 @@ import pandas as pd
 import xarray as xr
 
 from magbridge.columns import absent
+from magbridge.datasets import with_guesses
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.clocks import TimeFormat
-from magbridge.logs.deployment import deployment, plain_attrs, with_guesses, with_losses
+from magbridge.logs.deployment import deployment, plain_attrs, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout
 from magbridge.logs.naming import name_columns
 from magbridge.logs.table import TableReader
@@ -59,7 +60,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
         attrs = {"time_reference": "utc"} | attrs
     attrs = {**attrs, **layout.attrs, **table.attrs}
     if foreign:
-        attrs = with_guesses(path, attrs, [*layout.guesses, *table.guesses])
+        attrs = with_guesses(path.name, attrs, [*layout.guesses, *table.guesses])
     row = 1
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
         numbers = range(row, row + batch.num_rows)

@@ -45,8 +45,9 @@ import xarray as xr
 from msgspec.structs import replace
 
 from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT
+from magbridge.datasets import with_guesses
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, lasting, with_guesses, with_losses
+from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, lasting, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, cells, header_of, is_remark, rows_among
 from magbridge.logs.mapping import ColumnSource, Options, makers
 from magbridge.logs.naming import name_columns, units_of_angles
@@ -120,7 +121,7 @@ def _chunks(
     layout = units_of_angles(layout, first_rows) if foreign else layout
     table = TableReader(path, layout, first_rows, strict=options.strict)
     attrs = {**_attributes(path), **layout.attrs, **table.attrs}
-    attrs = with_guesses(path, attrs, [*guess, *layout.guesses, *table.guesses])
+    attrs = with_guesses(path.name, attrs, [*guess, *layout.guesses, *table.guesses])
     numbered = enumerate(chain(header, further, lines), 1 - added)
     wanted = _marked(numbered, layout.first + 1 - added)
     while block := list(islice(wanted, rows)):
@@ -335,8 +336,6 @@ MAGARROW_HEADINGS = [
 """Headings of Geometrics' MagArrow, in its order. GeoHammer finds them by name, MagComPy by their number."""
 MAGARROW_FORMS = {"Latitude": "%.8f", "Longitude": "%.8f", "Mag": "%.5f"}
 """Heading of a column that a log must have -> form of its numbers; ``NaN`` stands for an unknown value."""
-HEIGHTS = "altitude", "altitude_m", "height", "height_m"
-"""Names of a column with the height, m, in small letters; without one, the opposite of ``depth``."""
 
 
 class MagArrowWriter(FileWriter):
@@ -351,14 +350,13 @@ class MagArrowWriter(FileWriter):
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows; if `first`, write the headings before. FormatError: no field or no position."""
         field = "scalar_field" if "scalar_field" in dataset else "total_field"
-        heights = [str(name) for name in dataset.data_vars if str(name).lower() in HEIGHTS]
         declared = makers()["MagArrow"].columns.items()
         columns = {source.heading or "": (name, source.scale) for name, source in declared}
         columns |= {
             "Latitude": ("latitude", 1.0),
             "Longitude": ("longitude", 1.0),
             "Mag": (field, 1.0),
-            "Altitude": (heights[0], 1.0) if heights else ("depth", -1.0),
+            "Altitude": ("depth", -1.0),
             "Line": ("line", 1.0),
         }
         for heading in MAGARROW_FORMS:

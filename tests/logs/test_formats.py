@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import magbridge as mb
-from magbridge import logs
+from magbridge import datasets, logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
 from magbridge.logs.checks import MAX_CHANNEL_DELAY_S, MAX_MAGNITUDE, MIN_VALUE, REFERENCE_FIELD_RANGE_NT
 from magbridge.logs.deployment import deployment
@@ -265,6 +265,40 @@ def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
     assert first["/field"]["total_field"] == whole["total_field"][0]
     flags = [body for _, channel, _, body in found if channel.topic == "/quality"][9]
     assert [name for name, value in flags.items() if value is True] == ["extrapolated", "gap"]
+
+
+def test_a_height_is_the_opposite_of_the_depth_by_every_way_in(tmp_path: Path) -> None:
+    """At 4,000 m it changes the main field by 90 nT; a height above the ground does not count."""
+    k = np.arange(3)
+    place = {"latitude": 40.0 + 0.0 * k, "longitude": 3.0 + 0.0 * k}
+    frame = pd.DataFrame({"time": 1.7e9 + k, **place, "altitude [m]": 4000.0 + k})
+    truth = mb.reference_field(mb.from_frame(frame.assign(depth=-4000.0 - k)))
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    frame.to_parquet(tmp_path / "a.parquet")
+    named = {"altitude": 1.0, "gps_height": 1.0, "alt_ft": 1 / 0.3048, "z": 1.0}
+    raw = {
+        name: xr.Dataset(
+            {key: ("time", values) for key, values in place.items()} | {name: ("time", scale * (4000.0 + k))},
+            {"time": ("time", 1.7e9 + k, {"units": "seconds since 1970-01-01", "standard_name": "time"})},
+        )
+        for name, scale in named.items()
+    }
+    raw["z"]["z"].attrs = {"standard_name": "height_above_mean_sea_level", "units": "meters"}
+    raw["z"].to_netcdf(tmp_path / "a.nc")
+    files = [logs.read(tmp_path / f"a{suffix}") for suffix in (".csv", ".parquet", ".nc")]
+    for log in (*files, mb.from_frame(frame), *raw.values()):
+        np.testing.assert_allclose(mb.reference_field(log), truth, atol=1e-6)
+        assert "as height above the sea" in datasets.in_standard_units(log).attrs["guessed"]
+    raw["alt_ft"].to_netcdf(tmp_path / "b.nc")
+    declared = logs.read(tmp_path / "b.nc", options=logs.Options(column=("depth=alt_ft",)))
+    np.testing.assert_allclose(declared["depth"], -4000.0 - k)
+    assert "as height above the sea" in declared.attrs["guessed"]
+    for standard in ("height", "height_above_sea_floor"):
+        raw["altitude"]["altitude"].attrs = {"standard_name": standard, "units": "m"}
+        raw["altitude"].to_netcdf(tmp_path / "b.nc")
+        for log in (raw["altitude"], logs.read(tmp_path / "b.nc")):
+            assert "depth" not in datasets.in_standard_units(log)
+            assert "altitude" in log
 
 
 # ---- data frames in and out --------------------------------------------------------------------------------

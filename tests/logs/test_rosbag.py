@@ -198,7 +198,7 @@ def test_whatever_a_robot_says_is_as_rosbags_reads_it(kind: str, tmp_path: Path)
     expected = {
         "latitude": [one.latitude for one in last],
         "longitude": [one.longitude for one in last],
-        "altitude": [one.altitude for one in last],
+        "depth": [-one.altitude for one in last],
         "battery_current": [-one.current for one in theirs["/battery0"]],
         "battery_voltage": [one.voltage for one in theirs["/battery0"]],
         "battery2_current": [-one.current for one in theirs["/battery1"]],

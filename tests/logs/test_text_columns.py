@@ -369,7 +369,7 @@ def test_a_height_is_the_opposite_of_the_depth(heading: str, tmp_path: Path) -> 
     for column in ((), (f"depth={heading}",)):
         log = read(tmp_path, text, column=column)
         assert log["depth"].values == pytest.approx([-1000.0] * 40)
-        assert f"depth is minus {heading!r}, as height above the sea" in log.attrs["guessed"]
+        assert f"depth is minus '{heading.partition(' [')[0]}" in log.attrs["guessed"]
         assert not [hint for hint in info(log)["hints"] if "depth" in hint]
 
 
