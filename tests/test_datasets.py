@@ -108,6 +108,7 @@ def test_a_file_that_xarray_wrote_is_read_back(tmp_path: Path) -> None:
 
 SEEN = mb.observations(LOG, "battpos")
 FRAME = mb.to_frame(LOG)
+FIELDS = np.full((9, 3), 3e4)
 WRONG_ARGUMENTS: dict[str, tuple[Callable[..., object], tuple[object, ...], dict[str, object], str]] = {
     "no file": (mb.read, ([],), {}, "paths: expected at least one file, got none"),
     "absent file": (mb.read, ("none.csv",), {}, "none.csv: expected a file, there is none"),
@@ -126,6 +127,8 @@ WRONG_ARGUMENTS: dict[str, tuple[Callable[..., object], tuple[object, ...], dict
     "frame to correct": (mb.correct, (INCHES, FRAME), {}, "log: expected an xarray.Dataset, got DataFrame"),
     "frame to observe": (mb.observations, (FRAME,), {}, "log: expected an xarray.Dataset, got DataFrame"),
     "text for numbers": (mb.correct, (INCHES, "abc"), {}, "field, channels: expected numbers"),
+    "rows of channels": (mb.correct, (INCHES, FIELDS, FIELDS[:5, :1]), {}, r"expected shape \(9, 1\) for"),
+    "channels in rows": (mb.correct, (INCHES, FIELDS, FIELDS[:, :1].T), {}, r"expected shape \(9, 1\) for"),
     "number for names": (mb.observations, (LOG, 5), {}, "parameters: expected names of columns, got 5"),
     "mapping": (mb.observations, ({"time": [0.0]},), {}, "log: expected an xarray.Dataset, got dict"),
     "calibration": (mb.correct_rows, (INCHES, LOG), {}, "correction: expected a Correction, as"),

@@ -281,16 +281,14 @@ def correct(
     Raises
     ------
     CalibrationError
-        The number of columns of `channels` is not that of the calibration's channels.
+        `channels` has another shape.
     """
-    field = np.asarray(field, float)
-    n = len(field)
-    channels = np.asarray(channels, float).reshape(n, -1)
-    if channels.shape[1] != len(calibration.channels):
-        raise CalibrationError(
-            f"expected {len(calibration.channels)} channels ({', '.join(calibration.channels)}), "
-            f"found {channels.shape[1]}"
-        )
+    field, channels = np.asarray(field, float), np.asarray(channels, float)
+    n, names = len(field), calibration.channels
+    if channels.size != n * len(names) or (channels.ndim > 1 and len(channels) != n):
+        wanted = f"shape {(n, len(names))} for {', '.join(names)}" if names else "none"
+        raise CalibrationError(f"channels: expected {wanted}, got shape {channels.shape}")
+    channels = channels.reshape(n, len(names))
     out, turn = np.empty((8, n)), _omega_of(calibration)
     with np.errstate(all="ignore"):  # NaN inputs give NaN results, which are flagged below
         for part, prepared in _prepared_blocks(calibration, field, channels, time):

@@ -83,7 +83,8 @@ def box_flight(
     if not np.isfinite(angles).all():
         return None
     window = max(3, round(WINDOW_S / interval))
-    swing = np.sqrt(2.0 * uniform_filter1d(_band(angles, interval) ** 2, window, axis=0))
+    power = uniform_filter1d(_band(angles, interval) ** 2, window, axis=0)
+    swing = np.sqrt(2.0 * np.maximum(power, 0.0))  # rounding leaves running sums below zero
     relative = swing / np.array(USUAL_AMPLITUDE_DEG)
     # The axis with the largest swing relative to the usual amplitude, -1 without a swing, and the largest
     # swing of the other axes in units of its own.

@@ -1,5 +1,6 @@
 """Test the observations that are made from a deployment's columns."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,8 +87,10 @@ def drone(crash: int, n: int = 500) -> Observations:
     )
 
 
-def test_a_crash_is_left_out_and_reported() -> None:
-    found = fit(drone(60))
+@pytest.mark.parametrize("mapped", [True, False])
+def test_a_crash_is_left_out_and_reported(mapped: bool) -> None:
+    data = drone(60)
+    found = fit(data if mapped else replace(data, unmapped=np.ones(len(data), bool)))
     error, standardised = in_sensor_units(found.calibration, drone(0))
     assert found.details["ends"] == pytest.approx(60, abs=2)
     assert "ends_left_out" in codes(found)
@@ -96,8 +99,11 @@ def test_a_crash_is_left_out_and_reported() -> None:
     assert "ends" not in fit(drone(0)).details
 
 
-def test_scattered_outliers_and_halves_are_not_ends() -> None:
+def test_scattered_outliers_a_crustal_field_and_halves_are_not_ends() -> None:
     rng = np.random.default_rng(2)
+    above_rock = rng.normal(size=400) + np.where(np.arange(400) > 320, 30.0, 0.0)
+    assert (~flown(above_rock)).sum() == pytest.approx(79, abs=2)
+    assert flown(above_rock, 400.0).all()
     residual = rng.normal(size=400)
     residual[rng.choice(400, 40, replace=False)] = 50.0
     assert flown(residual).sum() >= 395

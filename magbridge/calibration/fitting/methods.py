@@ -50,6 +50,7 @@ from magbridge.calibration.fitting.solve import (
     starts,
     with_slow_noise,
 )
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, estimate_noise
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
@@ -57,6 +58,8 @@ from magbridge.estimation.residual import ResidualSamples, residuals_of
 
 # ---- Polynomials with physical priors ----
 
+CRUST_SIGMA = 3.0
+"""Largest error of a main-field model over its 1-sigma before the ends of a log contradict the rest."""
 SHRUNK = 0.15
 """Departure of the middle scale factor from 1 above which a fit is implausible."""
 
@@ -77,7 +80,8 @@ def fit_auto(
     while True:
         posed = pose(data, order, vehicle, known)
         best = best_climb(posed.samples, posed.family)
-        if (kept := flown(best.residual)).all():
+        crust = CRUST_SIGMA * MAIN_FIELD_SIGMA_NT if data.lacks_rock else 0.0
+        if (kept := flown(best.residual, crust)).all():
             break
         flight[flight], data = kept, data.part(kept)
     # 3. noise as a slow and a white part, if the residuals show both

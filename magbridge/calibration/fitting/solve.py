@@ -324,13 +324,14 @@ def successive(samples: ResidualSamples, rows: IndexArray) -> ResidualSamples:
     return part
 
 
-def flown(residual: FloatArray) -> BoolArray:
+def flown(residual: FloatArray, crust: float = 0.0) -> BoolArray:
     """Return a mask (n,) that is False for samples at the ends of the log that contradict the others.
 
     Such samples are a crash or a launch. `residual` (n,): of a robust fit, in the order of the log, nT.
+    `crust`: largest error of the reference by a crustal field that it lacks, nT.
     """
-    # an end is cut where most of its samples are outliers
-    off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
+    # an end is cut where most of its samples are outliers, which no crustal field below the ends explains
+    off = np.abs(residual) > max(OUTLIER_SIGMA * robust_scale(residual), crust)
     kept = np.ones(len(off), bool)
     kept[: _end(off)] = False
     kept[len(off) - _end(off[::-1]) :] = False
