@@ -9,13 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, bare, usual
 from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows, numbers_of
-from magbridge.logs.mapping import CELL_NUMBER, NAMES, PATTERNS, guess_of_height, is_called, is_unit, split
+from magbridge.logs.mapping import (
+    CELL_NUMBER,
+    NAMES,
+    PATTERNS,
+    ColumnSource,
+    guess_of_height,
+    is_called,
+    is_unit,
+    split,
+)
 
 AXES = "xyz"
 PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
@@ -68,7 +78,23 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     if layout.foreign and len(lines) == 1:
         layout = layout.renamed({lines[0]: "line"})
     layout = _with_time(_with_utm(layout).guessing(*guess_of_height(layout.declared)), rows)
-    return _without_texts(_with_total(_with_units_of_axes(layout, rows), rows), rows)
+    return _turned(_without_texts(_with_total(_with_units_of_axes(layout, rows), rows), rows))
+
+
+def _turned(layout: Layout) -> Layout:
+    """Return the layout with the field of ROS turned from FLU to FRD: y and z change their signs."""
+    declared, opposite = layout.declared.columns, ColumnSource(scale=-1.0)
+    turned = {
+        name: opposite
+        for name, heading in zip(layout.names, layout.headings, strict=True)
+        if name not in declared and re.fullmatch(r"mag\d*_[yz]", name) and PATTERNS["ROS"].match(heading)
+    }
+    if not turned:
+        return layout
+    columns = structs.replace(layout.declared, columns={**declared, **turned})
+    return replace(layout, declared=columns).guessing(
+        f"ROS axes turned from FLU to FRD: {', '.join(turned)} reversed"
+    )
 
 
 def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[str]) -> Layout:

@@ -86,6 +86,8 @@ def drawn(random: np.random.Generator) -> tuple[str, str, Any, Any]:
     }  # fmt: skip
     preamble = str(random.choice(["", "# made\n", "Logger 3\n"]))
     lines = [separator.join(written), *map(separator.join, zip(*written.values(), strict=True))]
+    if name.startswith("imu."):  # a topic of ROS has its y to port and its z up
+        field = field * [1.0, -1.0, -1.0]
     return kind, preamble + "\n".join(lines) + "\n", seconds, field
 
 

@@ -137,7 +137,7 @@ AXES = {
     "its length, uT": "time,mag_x,mag_y,mag_z\n1.6e9,20.5,-10.25,45\n",
     "its length, mG": "timestamp,RAW_IMU.xmag,RAW_IMU.ymag,RAW_IMU.zmag\n1.6e9,205,-102.5,450\n",
     "its length, T": "__time,/imu/magnetic_field/x,/imu/magnetic_field/y,/imu/magnetic_field/z\n"
-    "1.6e9,2.05e-5,-1.025e-5,4.5e-5\n",
+    "1.6e9,2.05e-5,1.025e-5,-4.5e-5\n",
     "one axis": "time,Mag_X (uT),Mag_Y,Mag_Z\n1.6e9,20.5,-10.25,45\n",
     "written out": "time,X (micro-Teslas),Y (micro-Teslas),Z (micro-Teslas)\n1.6e9,20.5,-10.25,45\n",
     "mGauss": "time,MagX (mGauss),MagY (mGauss),MagZ (mGauss)\n1.6e9,205,-102.5,450\n",
@@ -163,6 +163,23 @@ def test_the_axes_are_in_nanotesla(kind: str, tmp_path: Path) -> None:
     axes = np.column_stack([log[f"mag_{axis}"] for axis in "xyz"])
     np.testing.assert_allclose(axes, np.broadcast_to([20_500.0, -10_250.0, 45_000.0], axes.shape))
     assert "rows_dropped" not in log.attrs
+
+
+@pytest.mark.parametrize("path", ["/imu/mag/magnetic_field/", "field.magnetic_field.", "magnetic_field."])
+def test_ros_topics_in_a_table_are_turned_as_those_of_a_bag(path: str, tmp_path: Path) -> None:
+    """PlotJuggler's and rostopic's tables are in FLU axes; a declared axis, or another program's, is not."""
+    headings = [f"{path}{axis}" for axis in "xyz"]
+    text = f"%time,{','.join(headings)}\n" + "1600000000000000000,2.05e-5,1.025e-5,-4.5e-5\n"
+    log = read(tmp_path, text)
+    axes = [log[f"mag_{axis}"].values[0] for axis in "xyz"]
+    assert axes == pytest.approx([20_500.0, -10_250.0, 45_000.0])
+    assert "ROS axes turned from FLU to FRD: mag_y, mag_z reversed" in log.attrs["guessed"]
+    declared = [f"mag_{axis}={heading} [T]" for axis, heading in zip("xyz", headings, strict=True)]
+    log = read(tmp_path, text, column=declared)
+    assert log["mag_y"].values == pytest.approx([10_250.0])
+    assert "ROS" not in log.attrs["guessed"]
+    phone = "time,Magnetic Field x (T),Magnetic Field y (T),Magnetic Field z (T)\n1.6e9,2e-5,1e-5,4e-5\n"
+    assert read(tmp_path, phone)["mag_y"].values == pytest.approx([10_000.0])
 
 
 def test_three_columns_in_units_of_a_field_are_its_axes(tmp_path: Path) -> None:
