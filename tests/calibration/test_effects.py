@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gliders import Gliders
 from posed import EFFECTS
-from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import (
@@ -22,7 +21,6 @@ from magbridge.calibration.effects import (
     TimeEffect,
 )
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import read_vehicle
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import MAX_ORDER, Effect, LogSeries, Polynomial
@@ -221,39 +219,6 @@ def test_a_term_that_lacks_a_method_cannot_be_made() -> None:
 
     with pytest.raises(TypeError, match=r"abstract methods? .*begin"):
         Half()  # type: ignore[abstract]
-
-
-# ---- a sensor whose gain is far from 1 ---------------------------------------------------------------------
-
-
-EARTH_NED = (18_000.0, 0.0, 50_000.0)
-"""Main field at the site, nT."""
-
-
-def turned(gain: float, tilt: float, noise: float = 100.0, n: int = 1200) -> Observations:
-    """Return turns with roll and pitch of up to `tilt` deg, read by a sensor of this gain."""
-    time = np.arange(n, dtype=float)
-    angles = time * 3.0, tilt * np.sin(time / 37.0), tilt * np.sin(time / 23.0)
-    body = Rotation.from_euler("ZYX", np.column_stack(angles), degrees=True).inv().apply(EARTH_NED)
-    noises = noise * np.random.default_rng(0).standard_normal((n, 3))
-    reading = gain * body + (300.0, -200.0, 400.0) + noises
-    return Observations(reading, np.full(n, np.linalg.norm(EARTH_NED)), np.empty((n, 0)))
-
-
-@pytest.mark.parametrize("gain", [0.6, 0.8, 1.25])
-def test_a_gain_that_the_attitudes_show_is_found(gain: float) -> None:
-    found = fit(turned(gain, tilt=60.0), "nominal")
-    assert np.allclose(found.scales, 1.0 / gain, rtol=0.01)
-    assert found.supported
-
-
-@pytest.mark.parametrize("gain", [0.8, 1.25])
-def test_a_gain_that_the_attitudes_do_not_show_is_refused(gain: float) -> None:
-    """The prior of a usual gain decides, and the fit takes the rest of the field for an offset."""
-    found = fit(turned(gain, tilt=5.0), "nominal")
-    assert not found.supported
-    assert any("separate it from the offset" in text for text in found.calibration.warnings)
-    assert fit(turned(1.0, tilt=5.0), "nominal").supported
 
 
 # ---- The vehicle file that says where moving dipoles are ---------------------------------------------------

@@ -138,6 +138,19 @@ def test_a_fit_without_support_is_written_by_force_only(here: Path, command: Com
     assert (here / "cal.json").exists()
 
 
+@pytest.mark.parametrize("gain", [0.6, 0.8, 1.0, 1.25])
+def test_a_gain_is_found_where_the_attitudes_show_it_and_else_refused(gain: float) -> None:
+    """Else the prior of a usual gain decides, and the fit takes the rest of the field for an offset."""
+    fields = (gain * readings(tilt, 100.0) + IRON for tilt in (40.0, 3.5))
+    seen = (Observations(field, np.full(400, FIELD), np.empty((400, 0))) for field in fields)
+    wide, narrow = (fit(data, "nominal") for data in seen)
+    assert np.allclose(wide.scales, 1.0 / gain, rtol=0.01)
+    assert wide.supported
+    assert narrow.supported == (gain == 1.0)
+    doubtful = "separate it from the offset" in " ".join(narrow.calibration.warnings)
+    assert doubtful == (gain != 1.0)
+
+
 @pytest.mark.parametrize(("asked", "other"), [("auto", "nominal"), ("nominal", "auto")])
 def test_a_method_without_a_solution_is_replaced(
     asked: str, other: str, monkeypatch: pytest.MonkeyPatch
