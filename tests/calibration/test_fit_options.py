@@ -94,7 +94,7 @@ def test_calibrate_about_a_mean(here: Path, command: Command) -> None:
     write(turned(), "turns.csv")
     assert "--reference mean" in command.refuses(*asked)
     output = command(*asked, "--reference", "mean")
-    assert "turns.csv: the Earth's field is not known; the reference is the mean reading" in output.err
+    assert "turns.csv: the Earth's field is unknown; the reference is the mean reading" in output.err
     found = load(here / "cal.json")
     assert found.coefficients[6:9] == pytest.approx(IRON, abs=10.0)
     command("correct", "turns.csv", "--calibration", "cal.json", "-o", "corrected.csv")
@@ -102,7 +102,7 @@ def test_calibrate_about_a_mean(here: Path, command: Command) -> None:
     assert float(level.median()) == pytest.approx(0.02 * np.linalg.norm(EARTH), rel=0.1)
     known = turned().assign(reference_field=("time", np.full(400, 5e4), {"units": "nT"}))
     write(known, "known.csv")
-    assert "has positions or reference_field already" in command.refuses(
+    assert "has positions or reference_field; leave" in command.refuses(
         "calibrate", "known.csv", *asked[2:], "--reference", "mean", code=2
     )
 
