@@ -15,7 +15,7 @@ import re
 from collections.abc import Sequence
 from datetime import datetime
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -345,9 +345,14 @@ def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray
     if zone is not None and stamps.dt.tz is None:
         stamps = stamps.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
     counts = stamps.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy("datetime64[us]")
-    whole = counts.astype("datetime64[s]")  # converted separately, so that no digit is lost
-    times = whole.astype(np.int64) + ((counts - whole).astype(np.int64) * 1e-6 + seconds)
-    return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)
+    return since_1970(counts) + seconds
+
+
+def since_1970(moments: Any) -> FloatArray:
+    """Return datetime64 (n,) of any unit as s since 1970-01-01; NaN for NaT."""
+    whole = moments.astype("datetime64[s]")  # converted separately, so that no digit is lost
+    times = whole.astype(np.int64) + (moments - whole) / np.timedelta64(1, "s")
+    return np.asarray(np.where(np.isnat(moments), np.nan, times), np.float64)
 
 
 def leap_seconds(gps: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ import xarray as xr
 from magbridge.columns import absent
 from magbridge.datasets import with_guesses
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.clocks import TimeFormat
+from magbridge.logs.clocks import TimeFormat, since_1970
 from magbridge.logs.deployment import deployment, plain_attrs, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout
 from magbridge.logs.naming import name_columns
@@ -101,11 +101,11 @@ def _text(metadata: dict[bytes, bytes] | None, key: bytes) -> str:
 def _cells(path: Path, field: Any, array: Any, *, as_text: bool) -> Any:
     """Return the cells (n,) of a column, timestamps as s since 1970; FormatError: texts, unless `as_text`."""
     if pa.types.is_timestamp(field.type):
-        scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[field.type.unit]
-        return array.cast(pa.int64()).cast(pa.float64()).to_numpy(zero_copy_only=False) * scale
+        return since_1970(array.to_numpy(zero_copy_only=False))
     kinds = pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean
     if any(is_kind(field.type) for is_kind in kinds):
-        return array.cast(pa.float64()).to_numpy(zero_copy_only=False)
+        # unsafe: a count of ns since 1970 has more digits than float64, which keeps 0.3 us of it
+        return array.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     if as_text:
         return array.to_pandas()
     raise FormatError(path, f"expected numbers, not {field.type}", column=field.name)

@@ -316,6 +316,26 @@ def test_there_and_back_keeps_every_number_and_unit() -> None:
         assert back[name].attrs["units"] == log[name].attrs["units"]
 
 
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns", "ns, Europe/Berlin", "int64"])
+def test_times_of_any_unit_in_parquet_are_exact(unit: str, tmp_path: Path) -> None:
+    """float64 counts s since 1970 in steps of 0.24 us; a serial number may have more digits than it keeps."""
+    k = np.arange(50)
+    times = 1.7e9 + (k if unit == "s" else k / 8.0)
+    moments = pd.Series(pd.to_datetime(np.round(times * 1e3), unit="ms"))
+    if unit == "int64":
+        stamps = moments.astype("datetime64[ns]").astype(np.int64)
+    else:
+        stamps = moments.astype(f"datetime64[{unit[:2].strip(',')}]")
+    if "Berlin" in unit:
+        stamps = stamps.dt.tz_localize("UTC").dt.tz_convert("Europe/Berlin")
+    frame = pd.DataFrame({"time": stamps, "mag_x": 2e4 + k, "serial": (1 << 60) + k})
+    frame.to_parquet(tmp_path / "a.parquet")
+    log = logs.read(tmp_path / "a.parquet")
+    np.testing.assert_allclose(log["time"], times, rtol=0.0, atol=5e-7 if unit == "int64" else 0.0)
+    mb.to_frame(log).astype({"mag_x": int}).to_parquet(tmp_path / "b.parquet")
+    np.testing.assert_allclose(logs.read(tmp_path / "b.parquet")["time"], times, rtol=0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     "time",
     [
