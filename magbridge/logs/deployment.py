@@ -22,7 +22,7 @@ from magbridge.columns import (
 )  # fmt: skip
 from magbridge.datasets import conversion, in_standard_units, standard_log, with_guesses
 from magbridge.errors import AbsentColumns, FormatError
-from magbridge.logs.mapping import ColumnMapping, ColumnSource, guess_of_height, split
+from magbridge.logs.mapping import ColumnMapping, ColumnSource, guess_of_height, split, split_all
 from magbridge.records import Quality
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
@@ -356,7 +356,10 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
     FormatError
         The frame has no time, times do not increase, a column does not hold numbers, or a unit does not fit.
     """
-    named = dict(split(str(name)) for name in frame.columns)
+    named: dict[str, str] = {}
+    headings = [str(name) for name in frame.columns]
+    for heading, (name, unit) in zip(headings, split_all(headings), strict=True):
+        named[heading if name in named else name] = unit
     frame = frame.set_axis(list(named), axis=1)
     if "time" not in frame and isinstance(frame.index, pd.RangeIndex):
         raise FormatError(FRAME_NAME, "expected a column or an index of times", column="time")

@@ -21,7 +21,16 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import msgspec
 
-from magbridge.columns import COLUMNS, HEIGHT_GUESS, NT_PER_UNIT, bare, is_height, unit_of_height, usual
+from magbridge.columns import (
+    COLUMNS,
+    HEIGHT_GUESS,
+    NT_PER_UNIT,
+    bare,
+    factor,
+    is_height,
+    unit_of_height,
+    usual,
+)
 from magbridge.errors import WrongUse
 from magbridge.toml import Table, check_entries, convert, load_toml
 
@@ -31,6 +40,15 @@ CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
 NAMES = load_toml(Path(__file__).with_name("names.toml"))
 """Names of columns and units in other programs."""
+ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
+"""Standard name -> names in other programs, the least ambiguous first."""
+TOWED = NAMES["towed"].split()
+"""Words before the name of a position that mark it as the towed sensor's, not the ship's."""
+PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
+PREFIXED_NAME = re.compile(
+    rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
+)
+"""Name of a position or an angle, with the words that may stand before and after it."""
 PATTERNS = {name: re.compile(pattern) for name, pattern in NAMES["patterns"].items()}
 KNOWN_UNITS = {*NT_PER_UNIT, *(column.units for column in COLUMNS.values()), *NAMES["units"].split()} - {"1"}
 """Units by which a row of units under the headings is recognised."""
@@ -168,6 +186,7 @@ def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple
 def split(heading: str) -> tuple[str, str]:
     """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``, ``Bx, uT``.
 
+    The last three forms are those of fields, and of names that mean a standard column: ``yaw_rad``.
     The unit is "" for a heading without one; a number in brackets, as in ``magADC[0]``, is an index.
     """
     match = HEADING.fullmatch(heading.strip())
@@ -176,12 +195,31 @@ def split(heading: str) -> tuple[str, str]:
     if not name:  # a heading that is only brackets is a name
         return heading.strip(), ""
     if not unit:
-        for sign in "/_,":
-            header, _, tail = name.rpartition(sign)
-            tail = tail.strip()
-            if header and usual(tail) in NT_PER_UNIT and tail not in {"T", "G"}:
-                return header.strip(), tail
+        for sign in re.finditer("[/_,]", name):
+            header, tail = name[: sign.start()].strip(), name[sign.end() :].strip()
+            if header and _may_end(header, tail):
+                return header, tail
     return name, unit.strip()
+
+
+def split_all(headings: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the name and the unit of each heading; ``depth_m`` beside ``depth`` keeps its name."""
+    parts = [(heading, *split(heading)) for heading in headings]
+    kept = {heading for heading, name, _ in parts if heading != name in headings and heading[-1] not in "])"}
+    return [(heading, "") if heading in kept else (name, unit) for heading, name, unit in parts]
+
+
+def _may_end(name: str, unit: str) -> bool:
+    """Return True if a text behind a name is a unit of a field, or one that its standard column can have."""
+    if usual(unit) in NT_PER_UNIT:
+        return unit not in {"T", "G"}
+    meant = ["depth"] if is_height(name) else []
+    inner = PREFIXED_NAME.fullmatch(word := bare(name))
+    for column in COLUMNS.keys() - {"time", "quality"}:
+        known = {bare(column), *ALIASES.get(column, ())}
+        prefixed = column in PREFIXED_COLUMNS and inner is not None and inner[2] in known
+        meant += [column] if word in known or prefixed else []
+    return unit not in {"", "1"} and any(factor(unit, column) is not None for column in meant)
 
 
 def is_called(name: str, kind: str) -> bool:

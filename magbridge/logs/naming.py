@@ -17,26 +17,22 @@ from magbridge.errors import AbsentColumns, FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows, numbers_of
 from magbridge.logs.mapping import (
+    ALIASES,
     CELL_NUMBER,
     NAMES,
     PATTERNS,
+    PREFIXED_COLUMNS,
+    PREFIXED_NAME,
+    TOWED,
     ColumnSource,
     guess_of_height,
     is_called,
     is_unit,
     split,
-)
+    split_all,
+)  # fmt: skip
 
 AXES = "xyz"
-PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
-ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
-"""Standard name -> names in other programs, the least ambiguous first."""
-TOWED = NAMES["towed"].split()
-"""Words before the name of a position that mark it as the towed sensor's, not the ship's."""
-PREFIXED_NAME = re.compile(
-    rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
-)
-"""Name of a position or an angle, with the words that may stand before and after it."""
 MAX_SENSORS = 8
 """Largest number of a further vector sensor in one file."""
 NUMBERINGS = (r"0(\D*)$", r"{0}\1"), (r"1(\D*)$", r"{1}\1"), (r"(.)$", r"{1}\1"), (r"$", r"{1}")
@@ -69,7 +65,7 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     if layout.separator != ",":
         sign = {"\t": "tabs", " ": "blanks"}.get(layout.separator, repr(layout.separator))
         layout = layout.guessing(f"fields separated by {sign}")
-    parts = [split(heading) for heading in layout.headings]
+    parts = split_all(layout.headings)
     declares = [parts[k][1] or (units[k] if k < len(units) else "") for k in range(len(parts))]
     layout = _with_names(path, layout, [name for name, _ in parts], declares)
     for k, name in enumerate(layout.names):

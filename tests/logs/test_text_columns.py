@@ -13,10 +13,12 @@ import xarray as xr
 from texts import NOON, lines, read
 
 from magbridge import logs
+from magbridge.columns import COLUMNS
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.logs import Options
-from magbridge.logs.deployment import passed_over
+from magbridge.logs.deployment import from_frame, passed_over
 from magbridge.logs.info import info
+from magbridge.logs.mapping import split
 
 HEADER = "time,mag_x [nT],mag_y [nT],mag_z [nT]"
 
@@ -375,6 +377,29 @@ def test_parquet_with_letters_next_to_its_places_and_a_time_in_two_columns(tmp_p
 THEIRS = "Zeit;Bx [mG];By [mG];Bz [mG];Batt;Kurs\n2022-05-04T12:00:00Z;300,0;50,0;450,0;12,7;90\n"
 
 
+UNITS_IN_NAMES = {
+    "roll_rad": 57.29577951308232, "Roll/rad": 57.29577951308232, "ins_pitch_rad": 57.29577951308232,
+    "yaw_rad": 57.29577951308232, "heading_degree": 1.0, "lat_rad": 57.29577951308232, "depth_cm": 0.01,
+    "depth/ft": 0.3048, "sensor_temperature_degC": 1.0, "velocity_north_m/s": 1.0, "water_speed_mps": 1.0,
+    "velocity_east/cm/s": 0.01, "local_north_km": 1e3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("heading", UNITS_IN_NAMES)
+def test_a_unit_behind_the_name_of_a_standard_column_is_its_unit(heading: str, tmp_path: Path) -> None:
+    """Angles in rad of such a name were telemetry without a unit; a rate beside them is no angle."""
+    others = "time,roll_rad/s,depth_min,current_A"
+    log = read(tmp_path, lines(f"{others},{heading}", lambda k: f"{NOON + k},9,8,7,{0.01 * k}"))
+    (column,) = {*log.data_vars} - {"roll_rad/s", "depth_min", "current_A"}
+    assert column in COLUMNS
+    assert log[column].attrs["units"] == COLUMNS[column].units
+    np.testing.assert_allclose(log[column], 0.01 * np.arange(40) * UNITS_IN_NAMES[heading])
+    frame = pd.DataFrame({"time": NOON + np.arange(3.0), "depth_m": 1.0, "depth": 2.0, "roll_rad": np.pi})
+    assert {name: one.values[0] for name, one in from_frame(frame).items()} == {
+        "depth_m": 1.0, "depth": 2.0, "roll": pytest.approx(180.0),
+    }  # fmt: skip
+
+
 HEIGHTS = ["altitude [m]", "altitude [ft]", "alt_ft", "GPS height", "Altitude_m", "alt_msl"]
 
 
@@ -386,7 +411,7 @@ def test_a_height_is_the_opposite_of_the_depth(heading: str, tmp_path: Path) -> 
     for column in ((), (f"depth={heading}",)):
         log = read(tmp_path, text, column=column)
         assert log["depth"].values == pytest.approx([-1000.0] * 40)
-        assert f"depth is minus '{heading.partition(' [')[0]}" in log.attrs["guessed"]
+        assert f"depth is minus '{split(heading)[0]}" in log.attrs["guessed"]
         assert not [hint for hint in info(log)["hints"] if "depth" in hint]
 
 
