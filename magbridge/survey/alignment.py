@@ -402,7 +402,7 @@ class _JointFit:
                 np.std(effect)
             )
         contribution["lag and lever arm"] = float(np.std(slopes @ self.shift[self.free]))
-        raw = crossovers(rows.samples.place, rows.samples.line).misties(rows.raw)
+        raw = crossovers(rows.samples).misties(rows.raw)
         return samples, self._terms(parts, contribution, rms(raw) if len(raw) else 0.0)
 
     def _terms(self, parts: list[FloatArray], contribution: dict[str, float], misties: float) -> ScalarTerms:

@@ -97,16 +97,17 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
     samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:
-            found = _gridded(samples, start)
+            found, doubts = _gridded(samples, start)
         except np.linalg.LinAlgError as problem:
             left_out = "".join(f"; {reason.text}" for reason in samples.left_out)
             raise CalibrationError(
                 f"the map's equations are singular to rounding ({problem}): survey fewer lines at once, or "
                 f"thin the log{left_out}"
             ) from problem
+    warnings += doubts
     # Levels and slow changes are about their mean over the survey, which is not that of all times.
     samples = replace(samples, level_sigma=hypot(samples.level_sigma, mean_sigma(found.levels)))
-    ties = crossovers(samples.place, samples.line)
+    ties = crossovers(samples)
     B = found.at_samples(samples)
     residual = samples.value - found.levels - B
     # Two passes at different depths read different fields: compare them at the map's depth.
@@ -157,23 +158,33 @@ def scalar_survey(
     return replace(made, scalar=terms, warnings=(*made.warnings, *doubts))
 
 
-def _gridded(samples: Samples, start: Choice | None) -> Gridded:
-    """Grid samples; if the track jumps, the sigma includes the effect of wrong positions.
+def _gridded(samples: Samples, start: Choice | None) -> tuple[Gridded, list[Diagnostic]]:
+    """Grid samples; if the track jumps, the sigma includes the effect of wrong positions, with a warning.
 
     Misplaced stretches contradict each other where they cross. Each stretch between jumps is therefore a line
-    with its own level, and without time, so that the contradictions do not count as slow changes.
+    with its own level, and without time, so that the contradictions do not count as slow changes. If they
+    agree there, the vehicle has moved farther than usual, for example in a pause of the log.
     """
     # A jump of the track cuts a line: places before and after it are wrong by different amounts.
     at = jumps(samples.place, samples.time)
     at = at[samples.line[at] == samples.line[at + 1]]
     if not len(at):
-        return gridded(samples, start=start)
+        return gridded(samples, start=start), []
     # Each stretch between jumps is a line of its own, without a time.
     first = np.diff(samples.line, prepend=samples.line[0]) != 0
     first[at + 1] = True
     apart = replace(samples, time=np.full(len(samples.time), np.nan), line=np.cumsum(first))
-    modes = np.hstack([samples.modes, _misplaced(apart, at, gridded(apart))])
-    return gridded(replace(apart, modes=modes))
+    found = gridded(apart)
+    ties = crossovers(replace(apart, time=samples.time))
+    between = apart.line[ties.first] != apart.line[ties.second]
+    misties = ties.misties(apart.value - found.levels)[between]
+    # More crossings than levels of stretches, with mis-ties as small as the noise: the positions are right.
+    if len(misties) > apart.line[-1] + 1 and _rms(misties) < CONTRADICTION * found.sigma:
+        return gridded(samples, start=start), []
+    modes = np.hstack([samples.modes, _misplaced(apart, at, found)])
+    values = {"step_m": float(np.linalg.norm(np.diff(samples.place, axis=0)[at], axis=1).max())}
+    doubt = Diagnostic("doubtful_places", values | {"jumps": counted(len(at), "jump")})
+    return gridded(replace(apart, modes=modes)), [doubt]
 
 
 def _misplaced(samples: Samples, line_ends: IndexArray, found: Gridded) -> FloatArray:

@@ -67,6 +67,16 @@ class Samples:
         """Return the number or name of the line of every label, by which the log and people know it."""
         return self.line_names or tuple(map(str, range(int(self.line.max(initial=-1)) + 1)))
 
+    def followed(self, gap: tuple[float, float]) -> BoolArray:
+        """Return True (n - 1,) for samples whose next one is on the same line and not across a `gap`.
+
+        A gap is longer than a number of median steps, and than a number of s (ignored without times).
+        """
+        timed = np.isfinite(self.time).all()
+        step = np.diff(self.time) if timed else np.linalg.norm(np.diff(self.place, axis=0), axis=1)
+        usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.inf
+        return np.asarray((np.diff(self.line) == 0) & (step <= max(gap[0] * usual, gap[1] * timed)))
+
     def part(self, rows: BoolArray | IndexArray) -> Samples:
         """Return the samples that `rows` selects, an (n,) mask or indices."""
         arrays: dict[str, Any] = {
@@ -152,8 +162,9 @@ def _bends(samples: Samples, lag: float) -> FloatArray:
     return out
 
 
-MAX_GAP_STEPS = 3.0
-"""Longest step between samples whose noise is correlated, in median steps of time (of place without time)."""
+NOISE_GAP, TRACK_GAP = (3.0, 0.0), (20.0, 60.0)
+"""Gaps across which noise is not correlated, and across which the track is unknown: longest step between
+samples, in median steps of time (of place without time) and at least in s."""
 
 
 class Rows:
@@ -173,10 +184,7 @@ class Rows:
         self.scale = roughness.evaluate(samples.place)
         self.kept = np.ones(len(samples.value), bool)
         # Noise is correlated between neighbours on one line only, and not across a gap.
-        timed = np.isfinite(samples.time).all()
-        step = np.diff(samples.time) if timed else np.linalg.norm(np.diff(samples.place, axis=0), axis=1)
-        usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.inf
-        self.next = (np.diff(samples.line) == 0) & (step <= MAX_GAP_STEPS * usual)
+        self.next = samples.followed(NOISE_GAP)
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
         """Return the matrix (m, nodes) from the field's coefficients to the anomaly at the samples `rows`."""
@@ -258,12 +266,15 @@ class Crossovers:
         return interpolate(self.first, self.share[:, 0]) - interpolate(self.second, self.share[:, 1])
 
 
-def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
-    """Return the crossovers of lines, from the samples' `place` (n, 2), m north and east, and `line` (n,)."""
+def crossovers(samples: Samples) -> Crossovers:
+    """Return the crossovers of the samples' lines; a gap in a log is no part of a line."""
+    place, line = samples.place, samples.line
     # Segments of several samples: their number limits the computing time.
     step = max(len(place) // SEGMENTS, 1)
     start = np.arange(0, len(place) - step, step)
-    start = start[line[start] == line[start + step]]
+    # A segment lies within one piece of a line without a gap.
+    whole = np.concatenate([[0], np.cumsum(~samples.followed(TRACK_GAP))])
+    start = start[whole[start] == whole[start + step]]
     a, way = place[start], place[start + step] - place[start]
     i, j = _nearby_pairs(a, way, line[start])
     # Segments a + s w and b + t v meet where s = (b - a) x v / (w x v) and t = (b - a) x w / (w x v).

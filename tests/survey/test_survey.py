@@ -211,6 +211,42 @@ def test_where_a_track_jumps_the_map_is_as_uncertain_as_its_places() -> None:
     assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
 
 
+def pausing(rock: Rock, shift: float) -> Samples:
+    """Return one log of three lines north and two ties east at 2.5 m/s, with a pause of 250 s after each.
+
+    The way to the first tie is 3.8 km. The true places of the ties are `shift` m north of those logged.
+    """
+    along, legs = np.arange(-1500.0, 1500.0, 25.0), []
+    for k, across in enumerate([-1200.0, 0.0, 1200.0, 1200.0, -1200.0]):
+        leg = np.stack([along, np.full(len(along), across)], axis=1)[:: -1 if k % 2 else 1]
+        legs.append(leg if k < 3 else -leg[:, ::-1])
+    place, n = np.concatenate(legs), 5 * len(along)
+    time = 10.0 * np.arange(n) + 250.0 * (np.arange(n) // len(along))
+    off = shift * (np.arange(n) >= 3 * len(along))[:, None] * [1.0, 0.0]
+    value = rock.at(place + off) + np.random.default_rng(6).normal(0.0, NOISE, n)
+    return Samples(place, np.zeros(n), time, value, np.zeros(n, int), np.zeros(n, bool), ORIGIN)
+
+
+def test_a_way_in_a_pause_of_the_log_is_neither_a_line_nor_an_error() -> None:
+    """It crosses all lines; its length made the sigma as large as the field, at an error below the noise."""
+    rock = rock_of(5)
+    done = survey(pausing(rock, 0.0))
+    assert len(done.found.place) == 6
+    assert not done.warnings
+    at = done.samples.place
+    anomaly, sigma = done.gridded.evaluate(at)
+    error = anomaly - rock.at(at)
+    error -= error.mean()
+    assert np.std(error) < 0.5 * NOISE
+    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
+
+
+def test_a_jump_whose_places_contradict_each_other_is_a_warning() -> None:
+    done = survey(pausing(rock_of(5), 300.0))
+    assert "doubtful_places" in [warning.code for warning in done.warnings]
+    assert np.median(done.gridded.evaluate(done.samples.place)[1]) > 5.0 * NOISE
+
+
 def test_crustal_field_is_searched_over_more_than_the_middle_of_a_dense_log(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -243,8 +279,8 @@ def test_crossing_is_where_the_lines_cross() -> None:
     """Two straight lines; the value there is interpolated on each."""
     t = np.linspace(0.0, 100.0, 11)
     place = np.concatenate([np.stack([t, 0 * t + 33.0], axis=1), np.stack([0 * t + 52.0, t], axis=1)])
-    line = np.repeat([0, 1], 11)
-    found = crossovers(place, line)
+    zero = np.zeros(22)
+    found = crossovers(Samples(place, zero, zero, zero, np.repeat([0, 1], 11), zero > 0, ORIGIN))
     np.testing.assert_allclose(found.place, [[52.0, 33.0]])
     np.testing.assert_allclose(found.misties(place.sum(axis=1)), [0.0], atol=1e-9)
 
