@@ -68,7 +68,7 @@ class Samples:
         return self.line_names or tuple(map(str, range(int(self.line.max(initial=-1)) + 1)))
 
     def followed(self, gap: tuple[float, float]) -> BoolArray:
-        """Return True (n - 1,) for samples whose next one is on the same line and not across a `gap`.
+        """Return True (m,) for samples followed by one on the same line and not across a `gap`.
 
         A gap is longer than a number of median steps, and than a number of s (ignored without times).
         """
