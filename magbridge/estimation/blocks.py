@@ -66,15 +66,19 @@ class OffsetBlock(ParameterBlock):
 class SlowFunctions:
     """Array (n, r) of functions that change slowly with time, computed only for the rows that are indexed.
 
-    `time` (n,): times of the samples, s. `fastest`: half the period of the fastest function, s.
+    `time` (n,): times of the samples, s. `fastest`: half the period of the fastest function, s. `powers`:
+    number of powers of the time in addition.
 
     Notes
     -----
     A random walk over a time T is a constant plus the sum of ``sqrt(2) cos(pi k t/T)`` with independent
-    weights that decrease as 1/k (Karhunen-Loeve). It restarts after a gap of :data:`MAX_PAUSE_S`.
+    weights that decrease as 1/k (Karhunen-Loeve). It restarts after a gap of :data:`MAX_PAUSE_S`. The cosines
+    have no slope at the ends of a stretch; with the powers t and t², few of them represent a smooth change.
     """
 
-    def __init__(self, time: FloatArray, fastest: float = SHORTEST_CHANGE_HALF_PERIOD_S) -> None:
+    def __init__(
+        self, time: FloatArray, fastest: float = SHORTEST_CHANGE_HALF_PERIOD_S, powers: int = 0
+    ) -> None:
         self.time, self.stretch = time, np.cumsum(np.diff(time, prepend=time[:1]) > MAX_PAUSE_S)
         _, first, size = np.unique(self.stretch, return_index=True, return_counts=True)
         self.start = time[first]
@@ -83,7 +87,8 @@ class SlowFunctions:
         self.count = np.minimum(self.span / fastest, MAX_SLOW_FUNCTIONS).astype(int)
         self.levels = len(first) > 1
         """True if each stretch also has a constant, relative to the others."""
-        self.edges = np.cumsum([0, *(self.count + self.levels)])
+        self.powers = np.where(self.count > 0, powers, 0)
+        self.edges = np.cumsum([0, *(self.count + self.powers + self.levels)])
 
     @property
     def shape(self) -> FloatArray:
@@ -91,19 +96,19 @@ class SlowFunctions:
         # Weights of a random walk over a time T are proportional to sqrt(T) / k.
         level = [1.0] * self.levels
         growth = np.sqrt(self.span / self.span.max())
-        return np.concatenate(
-            [[*(g / np.arange(1, n + 1)), *level] for g, n in zip(growth, self.count, strict=True)]
-        )
+        sizes = zip(growth, self.count, self.powers, strict=True)
+        return np.concatenate([[*(g / np.arange(1, n + 1)), *[g] * m, *level] for g, n, m in sizes])
 
     def __getitem__(self, rows: IndexArray | slice) -> FloatArray:
         t, of = self.time[rows], self.stretch[rows]
         out = np.zeros((len(t), int(self.edges[-1])))
         for k in np.unique(of).tolist():
             mine, order = of == k, np.arange(1, self.count[k] + 1)
-            # Half waves of each stretch (Karhunen-Loeve of a random walk), and its constant.
+            # Half waves of each stretch (Karhunen-Loeve of a random walk), powers from -1 to 1, and constant.
             phase = np.pi * (t[mine] - self.start[k])[:, None] / self.span[k]
-            columns = [np.sqrt(2.0) * np.cos(order * phase), np.ones_like(phase)[:, : int(self.levels)]]
-            out[mine, self.edges[k] : self.edges[k + 1]] = np.hstack(columns)
+            powers = (2.0 * phase / np.pi - 1.0) ** np.arange(1, self.powers[k] + 1)
+            waves, level = np.sqrt(2.0) * np.cos(order * phase), np.ones_like(phase)[:, : int(self.levels)]
+            out[mine, self.edges[k] : self.edges[k + 1]] = np.hstack([waves, powers, level])
         return out
 
     def __matmul__(self, weights: FloatArray) -> FloatArray:

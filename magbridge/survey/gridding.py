@@ -326,7 +326,7 @@ def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
         groups = [ParameterBlock("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
         # Slow changes are offered: the evidence decides whether they are needed.
-        waves = SlowFunctions(samples.time)
+        waves = SlowFunctions(samples.time, powers=2)
         if len(waves.shape):
             groups.append(
                 ParameterBlock("slow change with time", waves, waves.shape, SLOW, SLOW_SPREAD, offered=True)

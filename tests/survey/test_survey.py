@@ -211,6 +211,17 @@ def test_where_a_track_jumps_the_map_is_as_uncertain_as_its_places() -> None:
     assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
 
 
+def test_slow_changes_include_the_daily_variation_of_half_a_day() -> None:
+    """Half waves alone have no slope at the ends: they were 2 nT off there."""
+    samples, _, _ = zigzag(np.random.default_rng(4), back=False)
+    time = 4.0 * samples.time
+    *_, slow = gridding.level_blocks(replace(samples, time=time))
+    columns, daily = slow.functions[:], 30.0 * np.sin(2.0 * np.pi * time / 86_400.0 + 0.5)
+    columns = np.column_stack([columns, np.ones(len(time))])
+    error = daily - columns @ np.linalg.lstsq(columns, daily)[0]
+    assert np.abs(error).max() < 0.1
+
+
 def pausing(rock: Rock, shift: float) -> Samples:
     """Return one log of three lines north and two ties east at 2.5 m/s, with a pause of 250 s after each.
 
