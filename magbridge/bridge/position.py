@@ -44,8 +44,7 @@ MAX_JUMP_M: Final = 10_000.0
 """Step of the position, in excess of `MAX_VEHICLE_SPEED_M_S`, that is not a jump, m. A correction after long
 dead reckoning is within it; over this distance the main field changes by at most 50 nT."""
 SUSPECT_US: Final = 900_000_000
-"""Time for which the vehicle must stay at a position beyond a jump before the bridge uses the position,
-µs."""
+"""Time, µs, for which the vehicle must stay at a position beyond a jump before the bridge uses it."""
 FIRST_US: Final = 60_000_000
 """Time after the first position in which a jump replaces the first positions, µs."""
 ALTITUDE_M: Final = -15_000.0, 100_000.0

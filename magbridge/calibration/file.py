@@ -169,7 +169,7 @@ def save(calibration: Calibration, path: str | Path) -> None:
     """Write a calibration to a file ``cal.json`` in one step, so that it is never incomplete.
 
     WriteError: the file cannot be written; the previous file is unchanged. WrongUse: `calibration` is not a
-    Calibration, but for example the result of a fit.
+    Calibration; the result of a fit has one.
     """
     expect("calibration", calibration, Calibration, "magbridge.load(path)")
     with atomic_path(path) as temporary:

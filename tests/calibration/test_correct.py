@@ -243,7 +243,7 @@ def test_forward_is_the_inverse(extra: bool) -> None:
 
 def test_wrong_number_of_channels_is_one_clear_line() -> None:
     cal = random_calibration(12)
-    with pytest.raises(CalibrationError, match="expected 2 channels \\(p0, p1\\), found 1"):
+    with pytest.raises(CalibrationError, match=r"expected shape \(1, 2\) for p0, p1, got shape \(1, 1\)"):
         correct(cal, np.zeros((1, 3)), np.zeros((1, 1)), np.zeros(1))
     with pytest.raises(CalibrationError, match="expected 2 values"):
         Corrector(cal).step(0, (0.0, 0.0, 0.0), (1.0,))

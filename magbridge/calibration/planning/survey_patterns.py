@@ -123,7 +123,7 @@ def propose(
 def _patterns(
     n: int, interval: float, speed: float, roll: float
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield name, course (n,) and bank (n,), rad, of every pattern of n samples, an `interval` (s) apart."""
+    """Yield name, course (n,) and bank (n,), rad, of every pattern of n samples, every `interval` (s)."""
     # Fraction of the survey at each sample; `level` flight has no bank.
     share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
     bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
