@@ -20,8 +20,8 @@ NOT_A_VERB = (
     "to with and or but as is are was were be been so more less also still now new old every each all some"
 ).replace(" ", "|")
 IMPERATIVES = (
-    "address assess bypass compress cross discuss express focus miss pass process suppress embed feed need "
-    "speed"
+    "address assess bypass compress cross discuss express focus miss pass press process suppress embed feed "
+    "need speed"
 ).replace(" ", "|")
 """Imperatives that end like another form of a verb."""
 FAULTS = {
