@@ -1,6 +1,6 @@
 """Check commit messages: ``area: imperative verb + object``, at most 72 characters.
 
-    python tools/commits.py           the commits that origin's main branch does not have
+    python tools/commits.py           the commits that origin's main branch does not have, at least the last
     python tools/commits.py RANGE     the commits of a range of git log
     python tools/commits.py --file F  a message in a file; as a hook: .git/hooks/commit-msg
 
@@ -55,7 +55,7 @@ def main() -> int:
     if sys.argv[1:2] == ["--file"]:
         found = [("message", Path(sys.argv[2]).read_text())]
     else:
-        found = commits(sys.argv[1] if sys.argv[1:] else "origin/HEAD..HEAD")
+        found = commits(sys.argv[1]) if sys.argv[1:] else commits("origin/HEAD..HEAD") or commits("-1")
     faulty = [(name, text.split("\n")[0], problem(text)) for name, text in found if problem(text)]
     for finding in faulty:
         print(*finding, sep=": ")
