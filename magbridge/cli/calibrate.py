@@ -36,7 +36,7 @@ SCALAR_REFERENCE_SIGMA_NT = 1.0
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ModelOptions:
-    """Options for the method of the fit, and for what is known about the vehicle.
+    """Options for the method of the fit, and for knowledge about the vehicle.
 
     Parameters
     ----------

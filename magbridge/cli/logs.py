@@ -75,7 +75,7 @@ def _show(file: str, facts: dict[str, Any]) -> None:
 
     from magbridge.logs.compasses import LogCompass
 
-    console = Console(highlight=False, markup=False)  # brackets in a name are no markup
+    console = Console(highlight=False, markup=False)  # a name may contain brackets
     console.print(Text.assemble((file, "bold"), f": {summary(facts)}"), soft_wrap=True)
     for compass in facts["compasses"]:
         one = convert(compass, LogCompass)

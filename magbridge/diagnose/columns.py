@@ -207,7 +207,7 @@ class Candidate:
     def joined_with(self, candidate: Candidate) -> Candidate:
         """Return this candidate and another one of the same cause as one candidate with all coefficients."""
         parts, one, two = (self, candidate), self.point, candidate.point
-        # Names of the second piece are numbered, for people to tell them apart
+        # Names of the second piece are numbered, so that people can distinguish them
         taken = self.names + tuple(one.shape)
         number = 2 + sum(name.startswith(f"{candidate.names[0]} (") for name in taken)
         mark = "" if set(taken).isdisjoint(candidate.names) else f" ({number})"

@@ -236,7 +236,7 @@ def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
 
 
 def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
-    """Return the mean product of samples of r (n,) that are `lag` intervals apart; 0 if there are none."""
+    """Return the mean product of samples of r (n,) at a distance of `lag` intervals; 0 if there are none."""
     before = np.searchsorted(slots, slots - lag)
     pair = slots[before] == slots - lag
     return float(np.mean(r[pair] * r[before[pair]])) if pair.any() else 0.0

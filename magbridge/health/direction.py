@@ -86,7 +86,7 @@ class DirectionCheck:
         inclination = asin(down)
         tilt = inclination - self._inclination
         turn = remainder(self._yaw + atan2(starboard, forward) - self._declination, 2.0 * pi)
-        # horizontal share of the field: near the pole there is no heading
+        # horizontal share of the field: near the pole a heading does not exist
         level = min(cos(inclination), cos(self._inclination))
         self._judge(time_us, tilt, turn if level > MIN_HORIZONTAL_FRACTION else 0.0)
         if self._tilted >= MIN_DIFFERING_CHECKS or self._turned >= MIN_DIFFERING_CHECKS:

@@ -57,7 +57,7 @@ SPIKE_DECAY: Final = 0.3
 BURST_DECAY: Final = 0.8
 BURST_SAMPLES: Final = 8
 """Fraction of an outlier's square that is added to the next sample's variance: after a spike, and in a burst.
-Outliers less than BURST_SAMPLES samples apart are a burst."""
+Outliers within BURST_SAMPLES samples are a burst."""
 RETURN: Final = 4.0
 EVIDENT: Final = 16.0
 """Normalised square of the distance from the level before the jumps up to which the field has returned, and

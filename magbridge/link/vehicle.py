@@ -329,7 +329,7 @@ class VehicleState:
             self._boot_ms, self._boot_us = boot_ms, t_us
 
     def _reboot(self) -> None:
-        """Count and report a reboot, and reset what it ends."""
+        """Count and report a reboot, and reset the state before it."""
         self.reboots += 1
         self.clock.reset()
         self.on_reboot()

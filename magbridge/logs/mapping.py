@@ -203,7 +203,7 @@ def split(heading: str) -> tuple[str, str]:
 
 
 def split_all(headings: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the name and the unit of each heading; ``depth_m`` beside ``depth`` keeps its name."""
+    """Return the name and the unit of each heading; ``depth_m`` next to ``depth`` keeps its name."""
     parts = [(heading, *split(heading)) for heading in headings]
     kept = {heading for heading, name, _ in parts if heading != name in headings and heading[-1] not in "])"}
     return [(heading, "") if heading in kept else (name, unit) for heading, name, unit in parts]

@@ -79,7 +79,7 @@ class SensorState:
         self.field, self.sampled = fields, now_s
 
     def difference(self, first: SensorState) -> tuple[float, float]:
-        """Return the total field minus the first sensor's, and 1-sigma, nT; NaN if apart in time."""
+        """Return the total field minus the first sensor's, and 1-sigma, nT; NaN if not of one time."""
         if not (self.field and first.field):
             return nan, nan
         apart_s = abs(self.field["time_usec"] - first.field["time_usec"]) * 1e-6

@@ -267,7 +267,7 @@ class Crossovers:
 
 
 def crossovers(samples: Samples) -> Crossovers:
-    """Return the crossovers of the samples' lines; a gap in a log is no part of a line."""
+    """Return the crossovers of the samples' lines; a gap in a log is not part of a line."""
     place, line = samples.place, samples.line
     # Segments of several samples: their number limits the computing time.
     step = max(len(place) // SEGMENTS, 1)

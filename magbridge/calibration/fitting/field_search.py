@@ -53,7 +53,7 @@ def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:
 
 
 def too_coarse(nodes: Nodes, length: float, alpha: int, finer: float = 1.0) -> bool:
-    """Return True if `nodes` are too far apart for a field of correlation `length`, m, and power `alpha`."""
+    """Return True if `nodes` are too sparse for a field of correlation `length`, m, and power `alpha`."""
     return length / nodes.spacing < 0.7 * _nodes_per_length(alpha, finer)
 
 

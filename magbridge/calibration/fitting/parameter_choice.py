@@ -182,7 +182,7 @@ def best_parameters(
         rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
         columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}
         explained = worths(found.calibration, data, columns, HINTED)
-        # The coefficients of a mass that moves with another one may have taken up the other's effect: if no
+        # The coefficients of a mass that moves with another one may contain the other's effect: if no
         # column explains the residual, fits decide.
         return max(explained, key=explained.__getitem__, default=next(iter(columns), None))
 
@@ -229,7 +229,7 @@ def _predicts_better(further: Fit, found: Fit) -> bool:
 
 
 def _is_distorted(further: Fit, found: Fit) -> bool:
-    """Return True if further columns, which correlate with the attitude, have taken up part of the scales."""
+    """Return True if further columns, which correlate with the attitude, have changed the scales."""
     departure, before = (max(abs(scale - 1.0) for scale in one.scales) for one in (further, found))
     return departure > max(before, USUAL_DEPARTURE)
 

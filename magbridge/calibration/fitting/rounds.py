@@ -286,7 +286,7 @@ class Rounds:
         return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
 
     def _sums(self, field: GaussianField, rows: IndexArray | None = None, step: int = 1) -> SampleSums:
-        """Return the normal equations of `rows`, a `step` apart, linearised about the last solution."""
+        """Return the normal equations of `rows`, every `step`-th sample, linear about the last solution."""
         # on new nodes the linearisation is about a field of 0
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
